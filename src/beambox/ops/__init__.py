@@ -1,0 +1,1 @@
+"""Operations: each folder holds a readable reference beside its fast versions."""

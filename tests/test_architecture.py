@@ -1,0 +1,97 @@
+"""Who may import whom, read from the syntax tree; and the size of files and functions."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "beambox"
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+# folder -> folders it may import. checks may be imported by all; a folder may always import itself.
+MAY_IMPORT = {
+    "geometry": set(),
+    "structures": {"geometry"},
+    "ops": {"geometry"},
+    "layers": {"ops", "geometry"},
+    "detectors": {"layers", "ops", "geometry", "structures", "zoo"},
+    "data": {"structures", "geometry", "ops"},
+    "metrics": {"structures", "geometry", "ops"},
+    "simulate": {"structures", "geometry", "ops", "data", "metrics"},
+    "visualise": {"structures", "geometry"},
+    "infer": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "zoo"},
+    "train": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "infer"},
+    "export": {"detectors", "structures", "layers", "ops", "geometry"},
+    "zoo": set(),
+}
+GEOMETRY_MAY_USE = {"__future__", "math", "dataclasses", "collections", "typing", "torch", "beambox"}
+
+
+def beambox_imports(tree: ast.AST) -> set[str]:
+    """Return the top folders of beambox that a module imports."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "beambox":
+            parts = node.module.split(".")
+            found |= {parts[1]} if len(parts) > 1 else {alias.name for alias in node.names}
+        if isinstance(node, ast.Import):
+            found |= {a.name.split(".")[1] for a in node.names if a.name.startswith("beambox.")}
+    return found
+
+
+def place(path: Path) -> str:
+    """Return the folder of the package in which a file lies, or the name of a file at the top."""
+    parts = path.relative_to(PACKAGE).parts
+    return parts[0] if len(parts) > 1 else path.stem
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_follow_the_table(path: Path) -> None:
+    folder = place(path)
+    used = beambox_imports(ast.parse(path.read_text(encoding="utf-8"))) - {folder, "checks", "__version__"}
+    if folder in MAY_IMPORT:
+        assert used <= MAY_IMPORT[folder], f"{folder} must not import {sorted(used - MAY_IMPORT[folder])}"
+    elif folder == "checks":
+        assert not used
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_only_relative_free_and_starless_imports(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            assert all(alias.name != "*" for alias in node.names), "no star imports"
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if place(p) == "geometry"], ids=lambda p: p.name)
+def test_geometry_is_plain_torch(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        assert {n.split(".")[0] for n in names} <= GEOMETRY_MAY_USE
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if place(p) == "cli"], ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_command_line_imports_nothing_heavy_at_module_level(path: Path) -> None:
+    light = {"checks", "cli", "__version__"}
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        assert beambox_imports(node) <= light if isinstance(node, ast.Import | ast.ImportFrom) else True
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        heavy = {n.split(".")[0] for n in names} & {"torch", "numpy", "numba", "matplotlib", "PIL", "pydantic"}
+        assert not heavy, f"import {sorted(heavy)} inside the command's function"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_and_functions_stay_readable(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    limit = 600 if place(path) == "detectors" else 500
+    assert len(text.splitlines()) <= limit, f"longer than {limit} lines: look for the missing idea"
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            assert node.end_lineno is not None
+            length = node.end_lineno - node.lineno + 1
+            assert length <= 90, f"{node.name} is {length} lines long: it should fit a screen"
