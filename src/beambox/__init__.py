@@ -39,7 +39,7 @@ _PUBLIC = {
     "load": "beambox.infer.predictor",
     "read_frame": "beambox.data.reading",
 }
-__all__ = [*_PUBLIC, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = sorted(_PUBLIC)  # noqa: PLE0605  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:

@@ -1,7 +1,7 @@
 """Boxes in the LiDAR frame, and angles.
 
 A box is ``[x, y, z, l, w, h, yaw]``: geometric centre, length along the heading, width across, height; metres and
-radians. Yaw 0 points along +x and grows counter-clockwise seen from above. The picture stands in ``docs/conventions.md``::
+radians. Yaw 0 points along +x and grows counter-clockwise seen from above. Drawn in ``docs/conventions.md``::
 
             x forward
             ^        heading of a box with yaw > 0
