@@ -25,15 +25,22 @@ class ImageAttributes:
     """``(N,)`` observation angle, radians."""
     image: Tensor
     """``(N, 4)`` left, top, right, bottom in pixels."""
+    camera: Tensor | None = None
+    """``(N, 7)`` float64 h, w, l, x, y, z, rotation_y exactly as a label file has them (bottom centre in the rectified
+    camera frame; metres, radians), or None where the boxes did not come from one."""
 
     def __post_init__(self) -> None:
         expect_shape("image", self.image, ("N", 4))
         expect_same_length(
             truncation=len(self.truncation), occlusion=len(self.occlusion), alpha=len(self.alpha), image=len(self.image)
         )
+        if self.camera is not None:
+            expect_shape("camera", self.camera, (len(self.image), 7))
 
     def __getitem__(self, index: Tensor | slice) -> ImageAttributes:
-        return ImageAttributes(self.truncation[index], self.occlusion[index], self.alpha[index], self.image[index])
+        camera = None if self.camera is None else self.camera[index]
+        columns = (self.truncation, self.occlusion, self.alpha, self.image)
+        return ImageAttributes(*(column[index] for column in columns), camera)
 
     def difficulty(self) -> Tensor:
         """KITTI's level of each object, ``(N,)`` int64: 0 easy, 1 moderate, 2 hard, -1 beyond hard (spec 1.2)."""
