@@ -1,0 +1,45 @@
+"""Non-maximum suppression of rotated boxes seen from above."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from beambox.checks import BeamboxError, expect_shape
+from beambox.ops.dispatch import Backend, always, choose
+from beambox.ops.nms import reference
+
+__all__ = ["nms"]
+
+BACKENDS = (Backend("reference", always, lambda: reference.nms),)
+
+
+def nms(boxes: Tensor, scores: Tensor, threshold: float, pre: int = 4096, post: int = 500) -> Tensor:
+    """Keep the best boxes that do not overlap a better kept one, whatever their class.
+
+    Greedy, by falling score; of equal scores the first box goes first. A box is dropped if its bird's-eye-view IoU with
+    a kept box is greater than the threshold. Boxes of NaN score are dropped. No gradient.
+
+    Args:
+        boxes: ``(N, 7)`` x, y, z, l, w, h, yaw; metres and radians.
+        scores: ``(N,)``.
+        threshold: IoU in [0, 1].
+        pre: look only at so many boxes of the highest scores.
+        post: keep at most so many.
+
+    Returns:
+        ``(K,)`` int64 rows of the kept boxes, best first.
+
+    Raises:
+        BeamboxError: if a shape does not fit, or a limit is negative.
+    """
+    expect_shape("boxes", boxes, (None, 7))
+    expect_shape("scores", scores, (len(boxes),))
+    if pre < 0 or post < 0:
+        raise BeamboxError(f"`pre` and `post` must not be negative, got {pre} and {post}")
+    boxes, scores = boxes.detach(), scores.detach()
+    known = (~scores.isnan()).nonzero().squeeze(1)
+    if post == 0 or pre == 0 or len(known) == 0:
+        return torch.empty(0, dtype=torch.int64, device=boxes.device)
+    kept = choose("nms", BACKENDS, boxes, scores)(boxes[known], scores[known], threshold, pre, post)
+    return known[kept]

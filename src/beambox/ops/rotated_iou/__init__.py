@@ -1,0 +1,54 @@
+"""Overlap of rotated boxes, seen from above and in three dimensions."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from beambox.checks import BeamboxError, expect_shape
+from beambox.ops.dispatch import Backend, always, choose
+from beambox.ops.rotated_iou import reference
+
+__all__ = ["intersection_bev", "iou_3d", "iou_bev"]
+
+BEV_BACKENDS = (Backend("reference", always, lambda: reference.iou_bev),)
+BOX_BACKENDS = (Backend("reference", always, lambda: reference.iou_3d),)
+AREA_BACKENDS = (Backend("reference", always, lambda: reference.intersection_bev),)
+
+
+def iou_bev(a: Tensor, b: Tensor) -> Tensor:
+    """Return the intersection over union of all pairs of boxes, seen from above.
+
+    Exact polygon clipping in float64. A box without area has IoU 0 with every box. Differentiable with respect to both
+    (by the reference version).
+
+    Args:
+        a: ``(N, 7)`` boxes x, y, z, l, w, h, yaw; metres and radians; a negative size counts as 0.
+        b: ``(M, 7)`` boxes.
+
+    Returns:
+        ``(N, M)`` in [0, 1], of the boxes' type.
+
+    Raises:
+        BeamboxError: if the boxes do not have seven columns or are not floating point.
+    """
+    _check(a, b)
+    return choose("iou_bev", BEV_BACKENDS, a, b)(a, b)
+
+
+def iou_3d(a: Tensor, b: Tensor) -> Tensor:
+    """Return the intersection over union of the volumes of all pairs of boxes; arguments as in :func:`iou_bev`."""
+    _check(a, b)
+    return choose("iou_3d", BOX_BACKENDS, a, b)(a, b)
+
+
+def intersection_bev(a: Tensor, b: Tensor) -> Tensor:
+    """Return the area in square metres shared by all pairs, seen from above; arguments as in :func:`iou_bev`."""
+    _check(a, b)
+    return choose("intersection_bev", AREA_BACKENDS, a, b)(a, b)
+
+
+def _check(a: Tensor, b: Tensor) -> None:
+    for name, boxes in (("a", a), ("b", b)):
+        expect_shape(name, boxes, (None, 7))
+        if not boxes.is_floating_point():
+            raise BeamboxError(f"`{name}` must be floating point, got {str(boxes.dtype).removeprefix('torch.')}")

@@ -1,0 +1,92 @@
+"""Sums, means and maxima over groups of rows, and rows laid onto a bird's-eye-view map."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
+from beambox.ops.dispatch import Backend, always, choose
+from beambox.ops.scatter import reference
+
+__all__ = ["scatter_bev", "segment_max", "segment_mean", "segment_sum"]
+
+SUM_BACKENDS = (Backend("reference", always, lambda: reference.segment_sum),)
+MEAN_BACKENDS = (Backend("reference", always, lambda: reference.segment_mean),)
+MAX_BACKENDS = (Backend("reference", always, lambda: reference.segment_max),)
+
+
+def segment_sum(values: Tensor, segment: Tensor, size: int) -> Tensor:
+    """Add the rows of each segment.
+
+    Args:
+        values: ``(K, C)`` floating point.
+        segment: ``(K,)`` int64 segment of each row, in any order, each in ``0 .. size - 1``.
+        size: number of segments S.
+
+    Returns:
+        ``(S, C)``; zero where a segment has no row.
+
+    Raises:
+        BeamboxError: if a shape or type does not fit, or a segment is out of range.
+    """
+    _check(values, segment, size)
+    return choose("segment_sum", SUM_BACKENDS, values, segment)(values, segment, size)
+
+
+def segment_mean(values: Tensor, segment: Tensor, size: int) -> Tensor:
+    """Average the rows of each segment; arguments and errors as in :func:`segment_sum`."""
+    _check(values, segment, size)
+    return choose("segment_mean", MEAN_BACKENDS, values, segment)(values, segment, size)
+
+
+def segment_max(values: Tensor, segment: Tensor, size: int) -> Tensor:
+    """Take the largest value of each segment and column; arguments and errors as in :func:`segment_sum`.
+
+    The gradient goes to one row: the first of those that hold the maximum, on every backend. A NaN counts as larger
+    than any number, so it is seen rather than skipped. Zero where a segment has no row.
+    """
+    _check(values, segment, size)
+    return choose("segment_max", MAX_BACKENDS, values, segment)(values, segment, size)
+
+
+def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[int, int]) -> Tensor:
+    """Lay voxel features onto a bird's-eye-view map; voxels above each other are added.
+
+    Args:
+        features: ``(V, C)``.
+        index: ``(V, 4)`` int64 (sample, z, y, x).
+        batch_size: number of samples B.
+        size: (ny, nx) cells of the map.
+
+    Returns:
+        ``(B, C, ny, nx)``, zero where no voxel is; laid out channels last, as convolutions like it.
+
+    Raises:
+        BeamboxError: if a shape or type does not fit, or an index leaves the map.
+    """
+    expect_shape("features", features, (None, None))
+    expect_shape("index", index, (len(features), 4))
+    expect_dtype("index", index, torch.int64)
+    ny, nx = size
+    if len(index):
+        low, high = index.amin(0).tolist(), index.amax(0).tolist()
+        if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
+            raise BeamboxError(
+                f"`index` (sample, z, y, x) must lie below ({batch_size}, any, {ny}, {nx}) and not below 0, "
+                f"got {tuple(low)} .. {tuple(high)}"
+            )
+    return reference.scatter_bev(features, index, batch_size, size)
+
+
+def _check(values: Tensor, segment: Tensor, size: int) -> None:
+    expect_shape("values", values, (None, None))
+    if not values.is_floating_point():
+        raise BeamboxError(f"`values` must be floating point, got {str(values.dtype).removeprefix('torch.')}")
+    expect_shape("segment", segment, (None,))
+    expect_dtype("segment", segment, torch.int64)
+    expect_same_length(values=len(values), segment=len(segment))
+    if len(segment):
+        low, high = (int(value) for value in segment.aminmax())
+        if low < 0 or high >= size:
+            raise BeamboxError(f"`segment` must lie in 0 .. {size - 1} (size {size}), got {low} .. {high}")
