@@ -1,0 +1,123 @@
+"""The `beambox` command: one dict of commands, each imported only when it is called."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+
+from beambox import __version__
+from beambox.checks import BeamboxError, did_you_mean
+
+__all__ = ["COMMANDS", "main"]
+
+# name -> (module whose `command` function it is, what it does in one line)
+COMMANDS: dict[str, tuple[str, str]] = {}
+
+EXAMPLES = (
+    ("beambox demo", "simulate, detect, score and draw: needs nothing but this package"),
+    ("beambox detect scan.bin --model pointpillars-sim", "find objects in a sweep: writes scan.json"),
+    ("beambox show scan.bin --model pointpillars-sim --out scan.png", "and look at them"),
+    ("beambox doctor scan.bin", "why are there no detections?"),
+    ("beambox simulate data --frames 200 --seed 1", "make a labelled data set"),
+    ("beambox train recipes/pointpillars-sim.yaml --data data --out run", "train on it"),
+    ("beambox evaluate run --data data", "and score the result"),
+)
+
+
+def help_text() -> str:
+    """Return what `beambox --help` prints: worked examples first, then the commands."""
+    known = [(text, what) for text, what in EXAMPLES if text.split()[1] in COMMANDS]
+    wide = max((len(text) for text, _ in known), default=0)
+    lines = [f"beambox {__version__}: LiDAR sweeps in, 3-D boxes out.", "", "Examples:"]
+    lines += [f"  {text:<{wide}}  # {what}" for text, what in known]
+    lines += ["", "Commands:"]
+    lines += [f"  {name:<18} {what}" for name, (_, what) in COMMANDS.items()]
+    lines += [
+        "",
+        "  beambox COMMAND --help   says what a command takes",
+        "  beambox --version        says which version this is",
+    ]
+    return "\n".join(lines)
+
+
+def guard(function: Callable[..., None]) -> Callable[..., None]:
+    """Turn what a user can cause into one line on stderr and an exit status; anything else keeps its traceback."""
+
+    @functools.wraps(function)
+    def guarded(*args: object, **kwargs: object) -> None:
+        try:
+            function(*args, **kwargs)
+        except BeamboxError as error:
+            stop(str(error), 2)
+        except KeyboardInterrupt:
+            stop("interrupted; files already written are whole and stay", 130)
+        except BrokenPipeError:  # the reader of a pipe has gone, as in `beambox models | head -1`
+            sys.stderr.close()
+            raise SystemExit(1) from None
+        except OSError as error:
+            stop(explain(error), 2)
+
+    return guarded
+
+
+def explain(error: OSError) -> str:
+    """Say in one sentence what the operating system refused."""
+    where = f"{error.filename}: " if error.filename else ""
+    what = error.strerror or str(error)
+    hint = ""
+    code = errno.errorcode.get(error.errno or 0, "")
+    if code in ("ENOSPC", "EDQUOT"):
+        hint = "; free some space or give another folder"
+    elif code in ("EACCES", "EPERM", "EROFS"):
+        hint = "; give a folder that may be written"
+    return f"{where}{what}{hint}"
+
+
+def stop(message: str, status: int) -> None:
+    """Print one line on stderr and leave."""
+    line = " ".join(message.split())
+    print(f"beambox: {line}", file=sys.stderr)
+    raise SystemExit(status)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line.
+
+    Args:
+        arguments: words after `beambox`; those of the process where None.
+
+    Raises:
+        SystemExit: 0 where all went well, 2 for anything the user can mend, 130 after an interrupt.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(help_text())
+        raise SystemExit(0)
+    if words[0] in ("-V", "--version"):
+        print(f"beambox {__version__}")
+        raise SystemExit(0)
+    name, rest = words[0], words[1:]
+    if name not in COMMANDS:
+        stop(f'there is no command "{name}"{did_you_mean(name, COMMANDS)}; see beambox --help', 2)
+    run(name, rest)
+
+
+def run(name: str, arguments: Sequence[str]) -> None:
+    """Import one command's module and hand it its arguments."""
+    import typer
+
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    settings = {"help_option_names": ["-h", "--help"]}
+    try:
+        module = import_module(COMMANDS[name][0])
+    except KeyboardInterrupt:
+        stop("interrupted", 130)
+    app.command(name, context_settings=settings)(guard(module.command))
+    app(args=list(arguments), prog_name=f"beambox {name}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,314 @@
+"""A sweep seen from above: points, boxes with headings, rings of distance, and a legend that says what is what."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from beambox.geometry import corners_bev
+from beambox.structures import Detections, Frame, Labels
+from beambox.visualise.canvas import SUPER, Canvas
+from beambox.visualise.colours import BACKGROUND, MUTED, PANEL, TEXT, TRUTH, Colour, class_colour, gradient
+
+__all__ = ["ColourBy", "Region", "draw_bev", "region_of"]
+
+ColourBy = Literal["height", "intensity"]
+
+PANEL_WIDTH = 250
+"""Pixels of the legend beside the map."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """What a picture shows, in metres of the LiDAR frame (x forward is up, y left is left)."""
+
+    x_min: float
+    y_min: float
+    x_max: float
+    y_max: float
+
+
+@dataclass(frozen=True)
+class _Map:
+    """Metres to pixels."""
+
+    region: Region
+    scale: float
+    """Pixels a metre."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        r = self.region
+        return round((r.y_max - r.y_min) * self.scale), round((r.x_max - r.x_min) * self.scale)
+
+    def pixels(self, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Carry ``(..., 2)`` x, y in metres to u, v."""
+        u = (self.region.y_max - xy[..., 1]) * self.scale
+        v = (self.region.x_max - xy[..., 0]) * self.scale
+        return np.stack((u, v), axis=-1)
+
+    def sees(self, xy: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Tell which ``(N, 2)`` places lie in the picture."""
+        r = self.region
+        return (xy[:, 0] >= r.x_min) & (xy[:, 0] <= r.x_max) & (xy[:, 1] >= r.y_min) & (xy[:, 1] <= r.y_max)
+
+
+def region_of(frame: Frame, boxes: torch.Tensor | None = None, reach: float = 80.0) -> Region:
+    """Choose what to show: nearly all points within ``reach`` metres, every box within it, in steps of 5 m."""
+    xy = frame.points[:, :2]
+    xy = xy[(xy.abs() <= reach).all(dim=1)].double().numpy()
+    if len(xy) < 2:
+        return Region(-reach / 2, -reach / 2, reach / 2, reach / 2)
+    low, high = np.quantile(xy, 0.002, axis=0), np.quantile(xy, 0.998, axis=0)
+    low, high = np.minimum(low, 0), np.maximum(high, 0)  # the sensor is always in the picture
+    if boxes is not None and len(boxes):
+        centres = boxes[:, :2].double().numpy()
+        centres = centres[(np.abs(centres) <= reach).all(axis=1)]
+        if len(centres):
+            low, high = np.minimum(low, centres.min(axis=0) - 3), np.maximum(high, centres.max(axis=0) + 3)
+    low, high = np.floor(low / 5) * 5, np.ceil(high / 5) * 5
+    return Region(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def draw_bev(
+    frame: Frame,
+    detections: Detections | None = None,
+    labels: Labels | None = None,
+    *,
+    region: Region | None = None,
+    colour_by: ColourBy = "height",
+    title: str = "",
+    longest: int = 1200,
+) -> Image.Image:
+    """Draw a sweep from above; needs no display.
+
+    Args:
+        frame: the points, and a name for the title.
+        detections: drawn in the colour of their class, the surer the brighter, with their score.
+        labels: the truth, drawn in green; dashed where detections are shown too.
+        region: metres to show; chosen from the points where None.
+        colour_by: what the points' colours say.
+        title: first line of the legend; the frame's name where empty.
+        longest: pixels of the map's longer edge.
+
+    Returns:
+        An RGB picture: the map, and a legend to its right.
+    """
+    boxes = [part.boxes.cpu() for part in (detections, labels) if part is not None]
+    region = region or region_of(frame, torch.cat(boxes) if boxes else None)
+    span = max(region.x_max - region.x_min, region.y_max - region.y_min)
+    view = _Map(region, longest / span)
+    width, height = view.size
+    height = max(height, 420)  # the legend needs this much
+    canvas = Canvas(width + PANEL_WIDTH, height, BACKGROUND)
+    limits = _draw_points(canvas, view, frame, colour_by)
+    _draw_rings(canvas, view)
+    tags = _Tags(canvas, width, height, _outline(view, torch.cat(boxes)) if boxes else None)
+    if detections is not None:
+        _draw_detections(canvas, view, detections)
+    if labels is not None:
+        _draw_labels(canvas, view, labels, dashed=detections is not None)
+    if detections is not None:
+        tags.add_all(
+            _outline(view, detections.boxes),
+            [(f"{s:.2f}", class_colour(n)) for s, n in zip(detections.scores.tolist(), detections.names)],
+        )
+    elif labels is not None:
+        tags.add_all(_outline(view, labels.boxes), [(name, TRUTH) for name in labels.names])
+    _draw_scale(canvas, view)
+    _draw_legend(canvas, width, height, frame, detections, labels, colour_by, limits, title)
+    return canvas.finish()
+
+
+def _draw_points(canvas: Canvas, view: _Map, frame: Frame, colour_by: ColourBy) -> tuple[float, float]:
+    points = frame.points.numpy()
+    points = points[view.sees(points[:, :2])]
+    value = points[:, 2] if colour_by == "height" else points[:, 3]
+    if len(value):
+        low, high = (float(q) for q in np.quantile(value, (0.02, 0.98)))
+    else:
+        low, high = 0.0, 1.0
+    high = max(high, low + 1e-3)
+    order = np.argsort(value, kind="stable")  # the high stand over the low
+    colours = gradient((value[order] - low) / (high - low))
+    canvas.dots(view.pixels(points[order, :2]), colours, size=3 if len(points) < 60_000 else 2)
+    return low, high
+
+
+def _draw_rings(canvas: Canvas, view: _Map) -> None:
+    r = view.region
+    far = math.hypot(max(abs(r.x_min), abs(r.x_max)), max(abs(r.y_min), abs(r.y_max)))
+    step = 10 if far <= 110 else 20
+    centre = view.pixels(np.array([0.0, 0.0]))
+    u, v = float(centre[0]), float(centre[1])
+    for distance in range(step, int(far) + 1, step):
+        canvas.circle((u, v), distance * view.scale, MUTED, width=0.5, alpha=90)
+        at = v - distance * view.scale  # the label stands on the ring, straight ahead; else straight behind
+        at = at if at > 8 else v + distance * view.scale
+        if 8 < at < view.size[1] - 8:
+            canvas.text((u + 4, at), f"{distance} m", MUTED, size=11, behind=BACKGROUND)
+    nose, left, right = (u, v - 9), (u - 6, v + 6), (u + 6, v + 6)
+    canvas.polygon((nose, left, (u, v + 3), right), TEXT)
+
+
+def _outline(view: _Map, boxes: torch.Tensor) -> NDArray[np.float64]:
+    return view.pixels(corners_bev(boxes.cpu().double()).numpy())  # (N, 4, 2)
+
+
+def _draw_heading(canvas: Canvas, corners: NDArray[np.float64], colour: Colour, width: float, alpha: int) -> None:
+    front = (corners[0] + corners[3]) / 2
+    centre = corners.mean(axis=0)
+    canvas.line((tuple(centre), tuple(front)), colour, width, alpha)
+
+
+def _draw_labels(canvas: Canvas, view: _Map, labels: Labels, dashed: bool) -> None:
+    for corners in _outline(view, labels.boxes):
+        ring = [tuple(c) for c in (*corners, corners[0])]
+        if dashed:
+            canvas.dashes(ring, TRUTH, width=1.5, dash=4)
+        else:
+            canvas.polygon(ring, TRUTH, alpha=36)
+            canvas.line(ring, TRUTH, width=1.5)
+        _draw_heading(canvas, corners, TRUTH, 1.5, 255)
+
+
+def _draw_detections(canvas: Canvas, view: _Map, detections: Detections) -> None:
+    scores = detections.scores.cpu().tolist()
+    outlines = list(zip(_outline(view, detections.boxes), detections.names, scores))
+    for corners, name, score in reversed(outlines):  # the surest on top
+        colour, alpha = class_colour(name), score_alpha(score)
+        ring = [tuple(c) for c in (*corners, corners[0])]
+        canvas.polygon(ring, colour, alpha=alpha // 5)
+        canvas.line(ring, colour, width=2, alpha=alpha)
+        _draw_heading(canvas, corners, colour, 2, alpha)
+
+
+def score_alpha(score: float) -> int:
+    """Return how opaque a detection is drawn: a third at score 0, wholly from 0.7 on."""
+    return round(255 * min(1.0, 0.3 + max(score, 0.0)))
+
+
+class _Tags:
+    """Words beside boxes, each where it covers no other; a tag without room is left out."""
+
+    def __init__(self, canvas: Canvas, width: int, height: int, boxes: NDArray[np.float64] | None) -> None:
+        self.canvas, self.width, self.height = canvas, width, height
+        self._taken: list[tuple[float, float, float, float]] = []
+        for corners in () if boxes is None else boxes:  # words do not cover boxes either
+            (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
+            self._taken.append((u0, v0, u1, v1))
+
+    def add_all(self, outlines: NDArray[np.float64], words: Sequence[tuple[str, Colour]]) -> None:
+        """Write beside boxes of ``(N, 4, 2)`` pixels; the first ones get the best places."""
+        for corners, (text, colour) in zip(outlines, words):
+            self._add(corners, text, colour)
+
+    def _add(self, corners: NDArray[np.float64], words: str, colour: Colour, size: float = 11) -> None:
+        half, tall = self.canvas.text_width(words, size) / 2, size * 0.6
+        (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
+        middle_u, middle_v = (u0 + u1) / 2, (v0 + v1) / 2
+        places = (
+            (u1 + half + 4, middle_v),
+            (u0 - half - 4, middle_v),
+            (middle_u, v0 - tall - 2),
+            (middle_u, v1 + tall + 2),
+        )
+        for u, v in places:
+            space = (u - half, v - tall, u + half, v + tall)
+            inside = space[0] > 0 and space[1] > 0 and space[2] < self.width and space[3] < self.height
+            if inside and not any(_overlap(space, other) for other in self._taken):
+                self._taken.append(space)
+                self.canvas.text((u, v), words, colour, size=size, anchor="mm", behind=BACKGROUND)
+                return
+
+
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _draw_scale(canvas: Canvas, view: _Map) -> None:
+    length = 10 * view.scale
+    u, v = 16.0, view.size[1] - 18.0
+    canvas.line(((u, v - 4), (u, v), (u + length, v), (u + length, v - 4)), TEXT, width=1.5)
+    canvas.text((u + length / 2, v - 9), "10 m", TEXT, size=11, anchor="mm", behind=BACKGROUND)
+
+
+def _draw_legend(
+    canvas: Canvas,
+    left: int,
+    height: int,
+    frame: Frame,
+    detections: Detections | None,
+    labels: Labels | None,
+    colour_by: ColourBy,
+    limits: tuple[float, float],
+    title: str,
+) -> None:
+    canvas.polygon(((left, 0), (left + PANEL_WIDTH, 0), (left + PANEL_WIDTH, height), (left, height)), PANEL)
+    u, v = left + 18, 30
+    canvas.text((u, v), title or frame.id or "sweep", TEXT, size=17)
+    v += 24
+    canvas.text((u, v), f"{len(frame):,} points", MUTED, size=12)
+    v += 34
+    if detections is not None:
+        v = _legend_detections(canvas, u, v, detections)
+    if labels is not None:
+        v = _legend_labels(canvas, u, v, labels, dashed=detections is not None)
+    _legend_gradient(canvas, u, v, colour_by, limits)
+
+
+def _legend_detections(canvas: Canvas, u: float, v: float, detections: Detections) -> float:
+    canvas.text((u, v), f"Detections: {len(detections)}", TEXT, size=13)
+    v += 24
+    names = detections.names
+    for name in detections.classes:
+        scores = [s for s, n in zip(detections.scores.tolist(), names) if n == name]
+        best = f"{len(scores)}, best {max(scores):.2f}" if scores else "0"
+        _swatch(canvas, u, v, class_colour(name), 255)
+        canvas.text((u + 38, v), f"{name}: {best}", TEXT if scores else MUTED, size=12)
+        v += 22
+    for k, score in enumerate((0.1, 0.4, 0.7)):
+        _swatch(canvas, u + 66 * k, v, TEXT, score_alpha(score))
+        canvas.text((u + 66 * k + 34, v), f"{score}{'+' if score == 0.7 else ''}", MUTED, size=11)
+    return v + 36
+
+
+def _legend_labels(canvas: Canvas, u: float, v: float, labels: Labels, dashed: bool) -> float:
+    canvas.text((u, v), f"Ground truth: {len(labels)}", TEXT, size=13)
+    v += 24
+    for name in sorted(set(labels.names)):
+        if dashed:
+            canvas.dashes(((u, v), (u + 26, v)), TRUTH, width=1.5, dash=4)
+        else:
+            _swatch(canvas, u, v, TRUTH, 255)
+        canvas.text((u + 38, v), f"{name}: {labels.names.count(name)}", TEXT, size=12)
+        v += 22
+    return v + 14
+
+
+def _swatch(canvas: Canvas, u: float, v: float, colour: Colour, alpha: int) -> None:
+    ring = ((u, v - 6), (u + 26, v - 6), (u + 26, v + 6), (u, v + 6), (u, v - 6))
+    canvas.polygon(ring, colour, alpha // 5)
+    canvas.line(ring, colour, width=2, alpha=alpha)
+    canvas.line(((u + 13, v), (u + 26, v)), colour, width=2, alpha=alpha)
+
+
+def _legend_gradient(canvas: Canvas, u: float, v: float, colour_by: ColourBy, limits: tuple[float, float]) -> None:
+    words, unit = ("Height z", " m") if colour_by == "height" else ("Intensity", "")
+    canvas.text((u, v), words, TEXT, size=13)
+    v += 18
+    width = PANEL_WIDTH - 36
+    colours = gradient(np.linspace(0, 1, width * SUPER))
+    bar = np.broadcast_to(colours, (10 * SUPER, *colours.shape))
+    canvas.image.paste(Image.fromarray(np.ascontiguousarray(bar)), (round(u * SUPER), round((v - 4) * SUPER)))
+    digits = 1 if colour_by == "height" else 2
+    canvas.text((u, v + 18), f"{limits[0]:.{digits}f}{unit}", MUTED, size=11)
+    canvas.text((u + width, v + 18), f"{limits[1]:.{digits}f}{unit}", MUTED, size=11, anchor="rm")
