@@ -1,0 +1,127 @@
+"""Sparse 3-D convolution: submanifold, strided and inverse, for training and inference on any device."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from beambox.checks import BeamboxError, expect_shape
+from beambox.ops.sparse_conv import reference
+from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple
+from beambox.ops.sparse_conv.tensor import SparseTensor
+
+__all__ = [
+    "Geometry",
+    "KernelMap",
+    "Sites",
+    "SparseTensor",
+    "inverse_conv3d",
+    "kernel_map",
+    "sparse_conv3d",
+    "submanifold_conv3d",
+]
+
+
+def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
+    """Return the map of a convolution from these sites, found once and kept with them."""
+    known = sites.maps.get(geometry)
+    if known is not None:
+        return known
+    if geometry.submanifold:
+        target = sites
+    else:
+        keys = reference.find_targets(sites, geometry)
+        target = Sites.from_keys(keys, geometry.output_shape(sites.shape), sites.batch_size)
+    found = KernelMap(sites, target, geometry, reference.neighbour_table(sites, target, geometry))
+    sites.maps[geometry] = found
+    return found
+
+
+def submanifold_conv3d(
+    x: SparseTensor, weight: Tensor, bias: Tensor | None = None, dilation: Triple = (1, 1, 1)
+) -> SparseTensor:
+    """Convolve at the active sites only, which stay as they are.
+
+    Args:
+        x: the input.
+        weight: ``(kz, ky, kx, C_in, C_out)``, sizes odd.
+        bias: ``(C_out,)`` or None.
+        dilation: (z, y, x).
+
+    Returns:
+        A tensor at the sites of ``x`` equal to a dense convolution with "same" padding read at these sites.
+    """
+    _check_weight(x, weight)
+    found = kernel_map(x.sites, Geometry.centred(_kernel(weight), dilation))
+    return SparseTensor(reference.convolve(x.features, weight.flatten(0, 2), bias, found), found.target)
+
+
+def sparse_conv3d(
+    x: SparseTensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    stride: Triple = (1, 1, 1),
+    padding: Triple = (0, 0, 0),
+    dilation: Triple = (1, 1, 1),
+) -> SparseTensor:
+    """Convolve, activating every output whose receptive field holds an active input.
+
+    Args:
+        x: the input.
+        weight: ``(kz, ky, kx, C_in, C_out)``.
+        bias: ``(C_out,)`` or None; added at active outputs only.
+        stride: (z, y, x).
+        padding: (z, y, x).
+        dilation: (z, y, x).
+
+    Returns:
+        A tensor whose sites ascend in (b, z, y, x).
+    """
+    _check_weight(x, weight)
+    found = kernel_map(x.sites, Geometry(_kernel(weight), stride, padding, dilation))
+    return SparseTensor(reference.convolve(x.features, weight.flatten(0, 2), bias, found), found.target)
+
+
+def inverse_conv3d(
+    x: SparseTensor,
+    weight: Tensor,
+    onto: Sites,
+    bias: Tensor | None = None,
+    stride: Triple = (1, 1, 1),
+    padding: Triple = (0, 0, 0),
+    dilation: Triple = (1, 1, 1),
+) -> SparseTensor:
+    """Carry features back through a strided convolution onto the sites it came from.
+
+    Equal to a dense transposed convolution read at the sites ``onto``.
+
+    Args:
+        x: the output of ``sparse_conv3d`` with this kernel, stride, padding and dilation on a tensor at ``onto``,
+            perhaps after submanifold layers.
+        weight: ``(kz, ky, kx, C_in, C_out)``.
+        onto: sites of the strided convolution's input.
+        bias: ``(C_out,)`` or None.
+        stride: (z, y, x) of the strided convolution.
+        padding: (z, y, x) of the strided convolution.
+        dilation: (z, y, x) of the strided convolution.
+
+    Raises:
+        BeamboxError: if ``x`` does not stand where that convolution would have put it.
+    """
+    _check_weight(x, weight)
+    found = kernel_map(onto, Geometry(_kernel(weight), stride, padding, dilation))
+    same = found.target is x.sites or (found.target.shape == x.shape and found.target.indices.equal(x.indices))
+    if not same:
+        raise BeamboxError(
+            f"`x` must stand at the {len(found.target)} sites of {found.target.shape} that this convolution makes of "
+            f"`onto`, got {len(x.sites)} sites of {x.shape}; give the same kernel, stride, padding and dilation"
+        )
+    return SparseTensor(reference.convolve(x.features, weight.flatten(0, 2), bias, found.inverse), onto)
+
+
+def _kernel(weight: Tensor) -> Triple:
+    kz, ky, kx = weight.shape[:3]
+    return kz, ky, kx
+
+
+def _check_weight(x: SparseTensor, weight: Tensor) -> None:
+    expect_shape("weight", weight, ("kz", "ky", "kx", x.channels, "C_out"))
