@@ -1,0 +1,84 @@
+"""`beambox score kitti|once`: score result files without running a detector."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from beambox.checks import BeamboxError
+from beambox.cli.main import guard
+
+__all__ = ["app", "parse_overlaps"]
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Score result files with the official rules of a benchmark.",
+)
+
+Json = Annotated[Path | None, typer.Option("--json", help="also write the numbers to this file")]
+Iou = Annotated[str, typer.Option("--iou", help="other IoU thresholds, for example Car=0.5,Pedestrian=0.25")]
+
+
+def parse_overlaps(text: str) -> dict[str, float]:
+    """Read IoU thresholds written as ``Car=0.5,Pedestrian=0.25``."""
+    found = {}
+    for part in filter(None, (piece.strip() for piece in text.split(","))):
+        name, sign, value = part.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            sign = ""
+        if not sign or not name.strip():
+            raise BeamboxError(f"--iou takes CLASS=NUMBER pairs such as Car=0.5,Pedestrian=0.25; cannot read {part!r}")
+    return found
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON beside the target first, so that no half-written file remains."""
+    import json
+    import os
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+@app.command()
+@guard
+def kitti(
+    labels: Annotated[Path, typer.Option(help="folder of label files (or the KITTI root above label_2)")],
+    results: Annotated[Path, typer.Option(help="folder of result files, one a frame; empty: nothing found")],
+    frames: Annotated[Path | None, typer.Option(help="file with one frame name a line; default: every label")] = None,
+    classes: Annotated[str, typer.Option(help="classes to score, comma-separated")] = "Car,Pedestrian,Cyclist",
+    iou: Iou = "",
+    no_difficulty: Annotated[
+        bool, typer.Option("--no-difficulty", help="every object counts; 3d and bev only")
+    ] = False,
+    python_port: Annotated[bool, typer.Option("--python-port", help="follow the Python port where it differs")] = False,
+    allow_missing: Annotated[bool, typer.Option("--allow-missing", help="no result file means nothing found")] = False,
+    json: Json = None,
+) -> None:
+    """Score KITTI result files as the official program does (needs no images, points or calibration)."""
+    from beambox.metrics.kitti import evaluate_files
+    from beambox.metrics.kitti_objects import read_frame_list
+
+    result = evaluate_files(
+        labels,
+        results,
+        None if frames is None else read_frame_list(frames),
+        [name.strip() for name in classes.split(",") if name.strip()],
+        min_overlap=parse_overlaps(iou),
+        no_difficulty=no_difficulty,
+        python_port=python_port,
+        allow_missing=allow_missing,
+    )
+    print(result.table(), end="")
+    if json is not None:
+        write_json(json, result.to_json())
