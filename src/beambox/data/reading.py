@@ -1,0 +1,223 @@
+"""Sweeps of any format: one function from a path to a frame.
+
+**Intensity** becomes a share of the largest possible value, in [0, 1], by what the file holds:
+
+* fractional numbers: nearly all at most 1: kept; all at most 255: divided by 255; at most 65535: by 65535; otherwise by
+  the largest;
+* whole numbers of 8 bits: divided by 255; wider ones: by 255 where none is larger, else by 65535, else by the largest.
+
+"Nearly all" is all but one in a thousand, so that a few stray values do not darken a whole sweep; what lies outside
+[0, 1] after scaling is clipped. ``intensity_scale`` replaces the rule by a factor (0.01 for percent). A file without
+intensity gets 0. Whatever was decided stands in :attr:`Frame.notes`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beambox.checks import BeamboxError, did_you_mean
+from beambox.data.formats.arrays import array_columns, read_npy, read_npz
+from beambox.data.formats.binary import read_bin
+from beambox.data.formats.columns import Columns
+from beambox.data.formats.las import read_las
+from beambox.data.formats.pcd import read_pcd
+from beambox.data.formats.ply import read_ply
+from beambox.structures import Frame
+
+__all__ = ["SUFFIXES", "points_from_array", "read_frame", "read_points"]
+
+READERS: dict[str, Callable[[Path], Columns]] = {
+    ".npy": read_npy,
+    ".npz": read_npz,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    ".las": read_las,
+    ".laz": read_las,
+}
+SUFFIXES = (".bin", *READERS)
+"""Endings of the files that can be read."""
+
+STANDARD = ("x", "y", "z", "intensity")
+ALIASES = {
+    "x": ("x", "X", "x_m", "pos_x"),
+    "y": ("y", "Y", "y_m", "pos_y"),
+    "z": ("z", "Z", "z_m", "pos_z"),
+    "intensity": (
+        *("intensity", "Intensity", "intensities", "i", "I", "reflectance", "Reflectance", "reflectivity"),
+        *("remission", "scalar_Intensity", "scalar_intensity", "refl", "r"),
+    ),
+}
+FAR = 10_000.0
+"""Clouds whose middle lies farther away than this are probably not in the sensor's frame, metres."""
+
+
+def read_frame(
+    path: Path | str, *, fields: str | Sequence[str] | None = None, intensity_scale: float | None = None
+) -> Frame:
+    """Read a sweep: .bin, .npy, .npz, .pcd, .ply, .las or .laz.
+
+    Points with NaN or infinite coordinates are dropped. An empty cloud is a frame without points.
+
+    Args:
+        path: the file; its ending tells the format.
+        fields: names of columns, as a list or as "x,y,z,intensity,ring". For .bin and unnamed arrays: what each column
+            of the file is, ``_`` for one to leave out; without it the first four are x, y, z, intensity. For formats
+            that name their columns: which to take. Columns beyond x, y, z and intensity follow these, as ordered here.
+        intensity_scale: a factor for intensity instead of the rule above.
+
+    Returns:
+        A frame named after the file, with ``(N, 4 or more)`` points and notes on what was decided.
+
+    Raises:
+        MissingFileError: if the file is not there.
+        BeamboxError: if it cannot be read, or has no x, y, z.
+    """
+    path = Path(path)
+    points, notes = _read(path, fields, intensity_scale)
+    return Frame(points, path.stem, notes=notes)
+
+
+def read_points(
+    path: Path | str, *, fields: str | Sequence[str] | None = None, intensity_scale: float | None = None
+) -> Tensor:
+    """Read only the points of a sweep, ``(N, 4 or more)`` float32; see :func:`read_frame`."""
+    return _read(Path(path), fields, intensity_scale)[0]
+
+
+def points_from_array(
+    array: np.ndarray | Tensor, intensity_scale: float | None = None
+) -> tuple[Tensor, tuple[str, ...]]:
+    """Turn an array in memory into points by the same rules.
+
+    Args:
+        array: ``(N, 3 or more)`` x, y, z, intensity; columns beyond the fourth are left out.
+        intensity_scale: a factor for intensity instead of the rule.
+
+    Returns:
+        ``(N, 4)`` float32 points and what was decided.
+    """
+    numbers = array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+    return _assemble(array_columns(numbers, "the array of points"), "the array of points", None, intensity_scale)
+
+
+def _read(path: Path, fields: str | Sequence[str] | None, scale: float | None) -> tuple[Tensor, tuple[str, ...]]:
+    names = _field_names(fields)
+    suffix = path.suffix.lower()
+    if suffix == ".bin":
+        return _assemble(_bin_columns(path, names), str(path), names, scale)
+    if suffix not in READERS:
+        raise BeamboxError(f'{path} has the ending "{suffix}", which no reader knows{did_you_mean(suffix, SUFFIXES)}')
+    columns = READERS[suffix](path)
+    if names is not None and suffix in (".npy", ".npz") and columns.names[4:5] in ((), ("column 5",)):
+        if len(names) != len(columns.names):
+            raise BeamboxError(f"{path} has {len(columns.names)} columns, but `fields` names {len(names)}: {names}")
+        columns = Columns(names, columns.arrays)
+    return _assemble(columns, str(path), names, scale)
+
+
+def _field_names(fields: str | Sequence[str] | None) -> tuple[str, ...] | None:
+    if fields is None:
+        return None
+    names = tuple(word.strip() for word in (fields.split(",") if isinstance(fields, str) else fields))
+    named = [name for name in names if name != "_"]
+    if not set("xyz") <= set(names) or len(set(named)) < len(named) or "" in names:
+        raise BeamboxError(
+            f'`fields` must name x, y and z, each name once, such as "x,y,z,intensity,ring"; got {names}'
+        )
+    return names
+
+
+def _bin_columns(path: Path, names: tuple[str, ...] | None) -> Columns:
+    names = STANDARD if names is None else names
+    points = read_bin(path, len(names))
+    return Columns(names, [points[:, k] for k in range(len(names))])
+
+
+def _assemble(
+    columns: Columns, where: str, fields: tuple[str, ...] | None, scale: float | None
+) -> tuple[Tensor, tuple[str, ...]]:
+    """Order the columns, drop what is not finite, scale intensity."""
+    place = {name: k for k, name in reversed(list(enumerate(columns.names)))}
+    chosen = {want: next((place[a] for a in ALIASES[want] if a in place), None) for want in STANDARD}
+    lacking = [want for want in "xyz" if chosen[want] is None]
+    if lacking:
+        raise BeamboxError(
+            f"{where} must have columns x, y and z; {' and '.join(lacking)} not found among "
+            f"{', '.join(columns.names) or 'none'}"
+        )
+    extra = [name for name in fields or () if name not in (*STANDARD, "_")]
+    for name in extra:
+        if name not in place:
+            raise BeamboxError(f'{where} has no column "{name}"{did_you_mean(name, columns.names)}')
+    notes = list(columns.notes)
+    if fields is None and columns.names[4:5] == ("column 5",):
+        notes.append(f"left out columns 5 to {len(columns.names)}: name them by `fields` to keep them")
+    picked = [_numbers(columns.arrays[chosen[want]]) for want in "xyz"]  # type: ignore[index]
+    points = np.zeros((len(columns), 4 + len(extra)), dtype=np.float32)
+    for k, array in enumerate(picked):
+        points[:, k] = array
+    for k, name in enumerate(extra, start=4):
+        points[:, k] = _numbers(columns.arrays[place[name]])
+    brightness = chosen["intensity"]
+    if brightness is None:
+        notes.append("no intensity in the file: filled with 0")
+    else:
+        points[:, 3], told = _scaled_intensity(columns.arrays[brightness], scale)
+        notes += told
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        notes.append(f"dropped {len(points) - int(finite.sum())} of {len(points)} points that are NaN or infinite")
+        points = points[finite]
+    if len(points) and float(np.abs(np.median(points[:, :2], axis=0)).max()) > FAR:
+        notes.append("the points lie far from the origin, but detectors expect the sensor there: shift them first")
+    return torch.from_numpy(points), tuple(notes)
+
+
+def _numbers(array: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes infinite, and is dropped
+        return array.astype(np.float32)
+
+
+def _scaled_intensity(array: np.ndarray, scale: float | None) -> tuple[np.ndarray, list[str]]:
+    """Apply the rule at the top of this module; NaN stays NaN."""
+    values = _numbers(array)
+    usual = values[np.isfinite(values)]
+    if len(usual) == 0:
+        return values, []
+    if scale is not None:
+        if not (math.isfinite(scale) and scale > 0):
+            raise BeamboxError(f"`intensity_scale` must be a positive number, got {scale}")
+        notes = [f"intensity multiplied by {scale:g} as asked"]
+        factor = np.float32(scale)
+    else:
+        top = _largest(array, usual)
+        notes = [] if top == 1 else [f"intensity divided by {top:g}"]
+        factor = np.float32(1 / top)
+    values = values * factor
+    with np.errstate(invalid="ignore"):
+        outside = int(((values < 0) | (values > 1)).sum())
+    if outside:
+        notes.append(f"clipped {outside} of {len(values)} intensities to [0, 1]")
+        values = values.clip(0, 1)
+    return values, notes
+
+
+def _largest(array: np.ndarray, usual: np.ndarray) -> float:
+    """Choose the value that stands for full intensity."""
+    highest = float(usual.max())
+    whole = array.dtype.kind in "iub"
+    if whole and array.dtype.itemsize == 1:
+        return 255.0
+    if not whole and highest > 1:
+        strays = len(usual) // 1000
+        if float(np.partition(usual, len(usual) - 1 - strays)[len(usual) - 1 - strays]) <= 1:
+            return 1.0
+    if highest <= 1 and not whole:
+        return 1.0
+    return next((top for top in (255.0, 65535.0) if highest <= top), highest)
