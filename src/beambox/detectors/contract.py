@@ -1,0 +1,68 @@
+"""What every detector offers: three explicit calls, and nothing kept between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from beambox.geometry.grid import VoxelGrid
+from beambox.structures.batch import Batch
+from beambox.structures.detections import Detections
+from beambox.structures.labels import Labels
+
+__all__ = ["DetectorConfig", "DetectorModel", "detections_from"]
+
+
+class DetectorConfig(Protocol):
+    """The least a detector's configuration says."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the network's outputs."""
+        ...
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The region and the cells the network works on."""
+        ...
+
+
+P = TypeVar("P")
+
+
+class DetectorModel(Protocol[P]):
+    """A network, its loss and its decoding.
+
+    ``predictions = model(batch)``, ``losses = model.loss(predictions, labels)``,
+    ``detections = model.decode(predictions)``. The model keeps parameters, not results.
+    """
+
+    config: Any
+
+    def __call__(self, batch: Batch, grid: VoxelGrid | None = None) -> P:
+        """Predict. ``grid``: another region with cells of the same size; the configured one where None."""
+        ...
+
+    def loss(self, predictions: P, labels: Sequence[Labels]) -> dict[str, Tensor]:
+        """Return named scalars, each already weighted: their sum is the total."""
+        ...
+
+    def decode(self, predictions: P) -> list[Detections]:
+        """Return the detections of each sample, best first."""
+        ...
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """As :class:`torch.nn.Module`'s."""
+        ...
+
+    def state_dict(self) -> Mapping[str, Tensor]:
+        """As :class:`torch.nn.Module`'s."""
+        ...
+
+
+def detections_from(kept: Sequence[tuple[Tensor, Tensor, Tensor]], classes: tuple[str, ...]) -> list[Detections]:
+    """Wrap (boxes, scores, labels) of each sample."""
+    return [Detections(boxes, scores, labels.to(torch.int64), classes) for boxes, scores, labels in kept]

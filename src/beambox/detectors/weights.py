@@ -1,0 +1,148 @@
+"""Weights on disk: safetensors with the configuration inside; loading never runs pickled code."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from beambox.checks import BeamboxError, MissingFileError
+from beambox.detectors.catalogue import build, config_to_dict, name_of
+
+__all__ = ["WeightFile", "load_weights", "read_weights", "save_weights", "write_atomically"]
+
+FORMAT = "beambox-weights-1"
+
+
+@dataclass(frozen=True)
+class WeightFile:
+    """What a weight file holds."""
+
+    detector: str
+    """Name in the catalogue."""
+    config: dict[str, Any]
+    """Its configuration as plain values."""
+    card: dict[str, Any]
+    """Where the weights come from: data, recipe, licence, scores."""
+    tensors: dict[str, Tensor]
+    """Parameters and buffers."""
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that it is either whole or absent: to a temporary name beside it, then renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        Path(temporary).unlink(missing_ok=True)
+        raise BeamboxError(f"cannot write {path}: {error.strerror or error}; nothing was left behind") from error
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def save_weights(
+    path: str | Path,
+    model: nn.Module,
+    card: Mapping[str, Any] | None = None,
+    *,
+    tensors: Mapping[str, Tensor] | None = None,
+    half: bool = False,
+) -> None:
+    """Write a model's weights and configuration.
+
+    Args:
+        path: file to write, ending in .safetensors.
+        model: a detector of the catalogue.
+        card: what to say of the weights.
+        tensors: values to write in place of the model's own (an average, say).
+        half: store floating-point values as float16.
+
+    Raises:
+        BeamboxError: if the file cannot be written; an older file of that name is then still whole.
+    """
+    values = {}
+    for name, value in (tensors if tensors is not None else model.state_dict()).items():
+        held = value.detach().cpu()
+        values[name] = (held.half() if half and held.is_floating_point() else held).contiguous()
+    header = {
+        "format": FORMAT,
+        "detector": name_of(model),
+        "config": json.dumps(config_to_dict(getattr(model, "config")), sort_keys=True),  # noqa: B009
+        "card": json.dumps(dict(card or {}), sort_keys=True),
+    }
+    write_atomically(Path(path), save(values, metadata=header))
+
+
+def read_weights(path: str | Path) -> WeightFile:
+    """Read a weight file without building anything.
+
+    Raises:
+        MissingFileError: if there is no such file.
+        BeamboxError: if it is not a weight file of this package or is damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"no weight file {path}; `beambox models` lists the shipped ones")
+    try:
+        with safe_open(str(path), framework="pt", device="cpu") as stream:
+            header = stream.metadata() or {}
+            if header.get("format") != FORMAT:
+                raise BeamboxError(
+                    f"{path} is a safetensors file, but not one of beambox's (no format {FORMAT} in its header)"
+                )
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}
+        return WeightFile(header["detector"], json.loads(header["config"]), json.loads(header["card"]), tensors)
+    except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
+        raise BeamboxError(
+            f"{path} is not a readable weight file ({error}); expected a whole .safetensors file written by beambox. "
+            "A checkpoint of OpenPCDet is converted by `beambox import-openpcdet`"
+        ) from error
+
+
+def load_weights(path: str | Path, device: torch.device | str = "cpu") -> nn.Module:
+    """Build the model a weight file describes and fill it; the model is in evaluation mode.
+
+    Raises:
+        BeamboxError: if the file cannot be read or its tensors do not fit its configuration.
+    """
+    stored = read_weights(path)
+    model = build(stored.detector, stored.config)
+    fill(model, stored.tensors, str(path))
+    return model.to(device).eval()
+
+
+def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
+    """Copy tensors into a model, in the model's own element types; every name and shape must fit.
+
+    Raises:
+        BeamboxError: naming the first tensor that is missing, unknown or of another shape.
+    """
+    own = model.state_dict()
+    missing, unknown = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
+    if missing or unknown:
+        said = [f"lacks {missing[0]} and {len(missing) - 1} more"] if missing else []
+        said += [f"has {unknown[0]} and {len(unknown) - 1} more that the model does not know"] if unknown else []
+        raise BeamboxError(f"{where} does not fit this {type(model).__name__}: it {' and '.join(said)}")
+    for name, value in own.items():
+        if value.shape != tensors[name].shape:
+            raise BeamboxError(
+                f"{where} does not fit this {type(model).__name__}: {name} has shape {tuple(tensors[name].shape)}, "
+                f"expected {tuple(value.shape)}"
+            )
+        value.copy_(tensors[name])

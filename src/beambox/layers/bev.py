@@ -1,0 +1,80 @@
+"""Two-dimensional convolutions on bird's-eye-view maps (SECOND, section 3.1; PointPillars, section 2.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from beambox.checks import expect_same_length
+
+__all__ = ["BevBackbone", "conv_bn_relu", "deconv_bn_relu"]
+
+BN_EPS = 1e-3
+BN_MOMENTUM = 0.01
+
+
+def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    """Convolution that keeps the size (divided by ``stride``), batch norm (eps 1e-3, momentum 0.01), ReLU."""
+    padding = dilation * (kernel // 2)
+    return nn.Sequential(
+        nn.Conv2d(in_channels, channels, kernel, stride, padding, dilation, bias=False),
+        nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
+        nn.ReLU(inplace=True),
+    )
+
+
+def deconv_bn_relu(
+    in_channels: int, channels: int, kernel: int, stride: int, padding: int = 0, output_padding: int = 0
+) -> nn.Sequential:
+    """Transposed convolution that enlarges by ``stride``, batch norm, ReLU."""
+    return nn.Sequential(
+        nn.ConvTranspose2d(in_channels, channels, kernel, stride, padding, output_padding, bias=False),
+        nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
+        nn.ReLU(inplace=True),
+    )
+
+
+class BevBackbone(nn.Module):
+    """Stages of convolutions at falling resolution, each brought back to one size and joined.
+
+    Stage i: one convolution with stride ``strides[i]`` and ``depths[i]`` further ones of width ``widths[i]``; its
+    output is enlarged ``up_strides[i]`` times to ``up_widths[i]`` channels.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        depths: Sequence[int],
+        strides: Sequence[int],
+        widths: Sequence[int],
+        up_strides: Sequence[int],
+        up_widths: Sequence[int],
+    ) -> None:
+        super().__init__()
+        expect_same_length(
+            depths=len(depths),
+            strides=len(strides),
+            widths=len(widths),
+            up_strides=len(up_strides),
+            up_widths=len(up_widths),
+        )
+        self.stages = nn.ModuleList()
+        self.ups = nn.ModuleList()
+        for depth, stride, width, up_stride, up_width in zip(depths, strides, widths, up_strides, up_widths):
+            layers = [conv_bn_relu(in_channels, width, stride=stride)]
+            layers += [conv_bn_relu(width, width) for _ in range(depth)]
+            self.stages.append(nn.Sequential(*layers))
+            self.ups.append(deconv_bn_relu(width, up_width, up_stride, up_stride))
+            in_channels = width
+        self.out_channels = sum(up_widths)
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, out_channels, Y / s, X / s)``, s the first stage's net stride."""
+        joined = []
+        for stage, up in zip(self.stages, self.ups):
+            bev = stage(bev)
+            joined.append(up(bev))
+        height, width = joined[0].shape[-2:]
+        return torch.cat([level[..., :height, :width] for level in joined], dim=1)

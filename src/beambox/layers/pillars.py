@@ -1,0 +1,57 @@
+"""The pillar feature network: a small PointNet over the points of each cell (PointPillars, section 2.1)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from beambox.ops.scatter import segment_max, segment_mean
+from beambox.ops.voxelize import Voxels
+
+__all__ = ["PillarFeatures"]
+
+
+class PillarFeatures(nn.Module):
+    """Describe each point by its place in its cell, pass it through one linear layer, keep the maximum of each cell.
+
+    Per point: x, y, z, intensity; offset from the mean of the cell's points (3); offset from the cell's centre (3).
+
+    The published code pads every cell to a fixed number of points, lets the padding into the batch norm's statistics
+    and, after ReLU, into the maximum. Here no padding exists and statistics are those of real points; with
+    ``empty_slots`` set, a cell with fewer points than that contributes ReLU(BN(0)) to the maximum, which makes the two
+    agree in evaluation mode.
+    """
+
+    def __init__(
+        self, channels: int = 64, columns: int = 4, absolute_xy: bool = True, empty_slots: int | None = None
+    ) -> None:
+        super().__init__()
+        self.absolute_xy = absolute_xy
+        self.empty_slots = empty_slots
+        inputs = columns + 6 - (0 if absolute_xy else 2)
+        self.linear = nn.Linear(inputs, channels, bias=False)
+        self.norm = nn.BatchNorm1d(channels, eps=1e-3, momentum=0.01)
+
+    def forward(self, voxels: Voxels) -> Tensor:
+        """Return one feature a cell, ``(V, channels)``, all at least 0."""
+        xyz = voxels.points[:, :3]
+        mean = segment_mean(xyz, voxels.voxel, len(voxels.index))  # (V, 3)
+        centre = voxels.grid.centre(voxels.index[:, 1:]).to(xyz.dtype)  # (V, 3)
+        absolute = voxels.points if self.absolute_xy else voxels.points[:, 2:]
+        described = torch.cat((absolute, xyz - mean[voxels.voxel], xyz - centre[voxels.voxel]), dim=1)
+        lifted = self.linear(described)  # (K, channels)
+        if len(lifted) < 2 and self.training:  # batch statistics need two values
+            lifted = functional.batch_norm(
+                lifted, self.norm.running_mean, self.norm.running_var, self.norm.weight, self.norm.bias, eps=1e-3
+            )
+        else:
+            lifted = self.norm(lifted)
+        features = segment_max(functional.relu(lifted), voxels.voxel, len(voxels.index))  # (V, channels)
+        if self.empty_slots is None:
+            return features
+        shift = self.norm.bias - self.norm.running_mean * self.norm.weight / torch.sqrt(
+            self.norm.running_var + self.norm.eps  # pyright: ignore[reportOperatorIssue, reportOptionalOperand]
+        )
+        padded = torch.maximum(features, functional.relu(shift).to(features.dtype))
+        return torch.where((voxels.count < self.empty_slots)[:, None], padded, features)
