@@ -1,0 +1,137 @@
+"""What a training run tells: lines on the console, a JSON-lines file, TensorBoard scalars, and where the time went."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+__all__ = ["Clock", "RunLog", "duration"]
+
+
+class Clock:
+    """Adds up the wall time of the parts of a step (on a GPU: until the work is queued, not until it is done)."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, part: str) -> Iterator[None]:
+        """Count the time inside the ``with`` under a name."""
+        start = time.perf_counter()
+        yield
+        self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - start
+
+    def shares(self) -> str:
+        """Tell each part's share, as ``4 % data, 40 % forward``, and start anew."""
+        total = sum(self.seconds.values()) or 1.0
+        told = ", ".join(f"{100 * spent / total:.0f} % {part}" for part, spent in self.seconds.items())
+        self.seconds = {}
+        return told
+
+
+def duration(seconds: float) -> str:
+    """Write a time as ``2 h 05 min``, ``3 min 20 s`` or ``12 s``."""
+    whole = max(0, round(seconds))
+    if whole >= 3600:
+        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    return f"{whole // 60} min {whole % 60:02d} s" if whole >= 60 else f"{whole} s"
+
+
+class RunLog:
+    """The voice of one run; silent in all processes but the first of a distributed run."""
+
+    def __init__(self, folder: Path, total: int, first: int, active: bool = True, tensorboard: bool = True) -> None:
+        """Open the log.
+
+        Args:
+            folder: the run's; gets ``log.jsonl`` and ``tensorboard/``.
+            total: steps of the run.
+            first: step at which it starts or goes on.
+            active: False silences it.
+            tensorboard: write TensorBoard scalars where the package is installed.
+        """
+        self.active, self.total, self.first = active, total, first
+        self.started = time.perf_counter()
+        self._console = Console(file=sys.stdout, soft_wrap=True, highlight=False)
+        self._file: IO[str] | None = None
+        self._board: Any = None
+        self._bar: Progress | None = None
+        self._heading: tuple[str, ...] = ()
+        if not active:
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = (folder / "log.jsonl").open("a", encoding="utf-8")
+        if tensorboard:
+            self._board = self._open_board(folder / "tensorboard", first)
+        if self._console.is_terminal:
+            columns = (TextColumn("step"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self._bar = Progress(*columns, console=self._console, transient=True)
+            self._task = self._bar.add_task("train", total=total, completed=first)
+            self._bar.start()
+
+    def _open_board(self, folder: Path, first: int) -> Any:
+        try:
+            from torch.utils.tensorboard.writer import SummaryWriter
+        except ImportError:
+            self.say("no TensorBoard log: tensorboard is not installed (pip install 'beambox[train]')")
+            return None
+        return SummaryWriter(str(folder), purge_step=first)
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        if self.active:
+            self._console.print(text, markup=False)
+            if not self._console.is_terminal:
+                sys.stdout.flush()
+
+    def progress(self, step: int) -> None:
+        """Move the bar, where there is one."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=step)
+
+    def losses(self, step: int, losses: Mapping[str, float], lr: float, times: str, seconds: float) -> None:
+        """Print one line of the table of losses, and record it.
+
+        Args:
+            step: steps made so far.
+            losses: means since the last line; ``total`` among them.
+            lr: learning rate of the last step.
+            times: where the time went.
+            seconds: wall time of a step.
+        """
+        if not self.active:
+            return
+        if tuple(losses) != self._heading:
+            self._heading = tuple(losses)
+            names = "".join(f"{name[:9]:>10}" for name in losses)
+            self.say(f"{'step':>8}{names}{'lr':>10}{'s/step':>8}  left")
+        left = duration(seconds * (self.total - step))
+        values = "".join(f"{value:>10.4f}" for value in losses.values())
+        self.say(f"{step:>8}{values}{lr:>10.2e}{seconds:>8.3f}  {left} (time: {times})")
+        self.record(step, {**{f"loss/{name}": value for name, value in losses.items()}, "lr": lr, "s/step": seconds})
+
+    def record(self, step: int, values: Mapping[str, float]) -> None:
+        """Write numbers to the files, without printing."""
+        if self._file is not None:
+            self._file.write(json.dumps({"step": step, **values}) + "\n")
+            self._file.flush()
+        if self._board is not None:
+            for name, value in values.items():
+                self._board.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """End the bar and close the files."""
+        if self._bar is not None:
+            self._bar.stop()
+        if self._board is not None:
+            self._board.close()
+        if self._file is not None:
+            self._file.close()

@@ -1,0 +1,333 @@
+"""The training loop: draw, forward, backward, step; validate, keep the best, and go on exactly where a run stopped."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from beambox import __version__
+from beambox.checks import BeamboxError
+from beambox.detectors.catalogue import build, config_to_dict, name_of
+from beambox.detectors.weights import fill, read_weights, save_weights
+from beambox.layers.bev import BevBackbone
+from beambox.train.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    optimizer_state,
+    part,
+    restore_module,
+    restore_optimizer,
+)
+from beambox.train.config import Recipe
+from beambox.train.devices import make_fabric
+from beambox.train.feed import Draws, Feed, TrainingBatch, stream
+from beambox.train.log import Clock, RunLog, duration
+from beambox.train.optim import Ema, adam, apply_schedule
+from beambox.train.sources import make_change, open_source
+from beambox.train.validate import Score, Validator
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+__all__ = ["Outcome", "Run", "train"]
+
+LAST, BEST, FINAL = "last.safetensors", "best.safetensors", "final.safetensors"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    step: int
+    """Optimiser steps made."""
+    finished: bool
+    """False where it was interrupted."""
+    weights: Path | None
+    """The weights to use: the best by validation, else the last; None where interrupted before any were written."""
+    score: float | None
+    """Validation score of the best weights, percent."""
+
+
+class TrainStep(nn.Module):
+    """Network and loss as one module, so that one forward pass of it is all that mixed precision and DDP see."""
+
+    def __init__(self, detector: nn.Module) -> None:
+        super().__init__()
+        self.detector = detector
+
+    def forward(self, work: TrainingBatch) -> dict[str, Tensor]:
+        """Return the named losses of a batch."""
+        predictions = self.detector(work.batch, work.grid)
+        with torch.autocast(work.batch.points.device.type, enabled=False):
+            return self.detector.loss(predictions, work.batch.labels)
+
+
+class Run:
+    """A detector in training: everything that changes from step to step, and how to save and restore it."""
+
+    def __init__(self, recipe: Recipe, detector: nn.Module, feed: Feed, fabric: Fabric, folder: Path) -> None:
+        self.recipe, self.detector, self.feed, self.fabric, self.folder = recipe, detector, feed, fabric, folder
+        optim = recipe.optim
+        per_epoch = feed.draws.epoch_size / optim.batch
+        self.total = optim.iterations or max(1, round((optim.epochs or 0) * per_epoch))
+        self.per_epoch = per_epoch
+        self.step = 0
+        self.best: float | None = None
+        self.validator: Validator | None = None
+        detector.to(memory_format=torch.channels_last)
+        if recipe.sync_batchnorm and fabric.world_size > 1 and fabric.device.type == "cuda":
+            detector = nn.SyncBatchNorm.convert_sync_batchnorm(detector)
+        self.module, self.optimizer = fabric.setup(TrainStep(detector), adam(detector.parameters(), optim))
+        self.ema = Ema(detector, recipe.ema.decay) if recipe.ema else None
+        self.names = {parameter: name for name, parameter in detector.named_parameters()}
+        if recipe.compile:
+            for layer in detector.modules():
+                if isinstance(layer, BevBackbone):
+                    layer.compile()
+
+    @property
+    def result(self) -> nn.Module:
+        """The module that is validated and exported: the average where there is one."""
+        return self.ema.module if self.ema else self.detector
+
+    def advance(self, work: TrainingBatch, clock: Clock) -> tuple[dict[str, Tensor], float]:
+        """Make one optimiser step; returns the losses, with ``total``, and the learning rate.
+
+        Raises:
+            BeamboxError: if the loss is NaN or infinite, with its parts.
+        """
+        # Only layers that draw random numbers (dropout) need it; it makes them a function of the step, for resuming.
+        torch.manual_seed((self.recipe.seed * 1_000_003 + self.step) * 4096 + self.fabric.global_rank)
+        lr = apply_schedule(self.optimizer.optimizer, self.recipe.optim, self.step, self.total)
+        with clock.measure("forward"):
+            losses = self.module(work.to(self.fabric.device))
+            total = torch.stack(list(losses.values())).sum()
+        if not bool(torch.isfinite(total)):
+            told = ", ".join(f"{name} {value.item():.4g}" for name, value in losses.items())
+            raise BeamboxError(
+                f"the loss is not finite at step {self.step} ({told}) on frames {', '.join(work.batch.frame_ids)}; "
+                f"the last checkpoint is from an earlier step; look at these frames or lower optim.lr"
+            )
+        with clock.measure("backward"):
+            self.fabric.backward(total)
+        with clock.measure("optim"):
+            if self.recipe.optim.clip is not None:
+                clip = self.recipe.optim.clip
+                self.fabric.clip_gradients(self.module, self.optimizer, max_norm=clip, error_if_nonfinite=False)
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+            if self.ema:
+                self.ema.update()
+        self.step += 1
+        return {**{name: value.detach() for name, value in losses.items()}, "total": total.detach()}, lr
+
+    def identity(self) -> dict[str, Any]:
+        """Name and config of the detector, as plain values."""
+        return {"name": name_of(self.detector), "config": config_to_dict(self.detector.config)}
+
+    def save(self) -> None:
+        """Write the checkpoint ``last.safetensors`` (by the first process alone)."""
+        if self.fabric.global_rank != 0:
+            return
+        tensors = {f"model.{name}": value for name, value in self.detector.state_dict().items()}
+        tensors |= optimizer_state(self.optimizer.optimizer, self.names)
+        state: dict[str, Any] = {"best": self.best, "precision": self.fabric.strategy.precision.state_dict()}
+        if self.ema:
+            tensors |= {f"ema.{name}": value for name, value in self.ema.module.state_dict().items()}
+            state["ema_updates"] = self.ema.updates
+        plain = self.recipe.model_dump(mode="json")
+        Checkpoint(tensors, self.step, plain, self.identity(), state).save(self.folder / LAST)
+
+    def restore(self) -> None:
+        """Go back to the state of ``last.safetensors``.
+
+        Raises:
+            BeamboxError: if it is of another detector, or of a run of another length.
+        """
+        path = self.folder / LAST
+        saved = load_checkpoint(path)
+        own = self.identity()
+        if saved.detector["name"] != own["name"]:
+            raise BeamboxError(f"{path} is of the detector {saved.detector['name']}, the recipe is of {own['name']}")
+        restore_module(self.detector, part(saved.tensors, "model."), str(path))
+        restore_optimizer(self.optimizer.optimizer, self.names, part(saved.tensors, "optim."))
+        if self.ema and "ema_updates" in saved.state:
+            restore_module(self.ema.module, part(saved.tensors, "ema."), str(path))
+            self.ema.updates = saved.state["ema_updates"]
+        if saved.state["precision"]:
+            self.fabric.strategy.precision.load_state_dict(saved.state["precision"])
+        self.step, self.best = saved.step, saved.state["best"]
+
+    def export(self, name: str, scores: Mapping[str, Any]) -> Path:
+        """Write the weights a user loads, with a card of where they come from."""
+        recipe = self.recipe.model_dump(mode="json", exclude={"workers", "threads", "log_every", "save_every"})
+        card = {"name": self.recipe.name, "step": self.step, "recipe": recipe, "beambox": __version__, **scores}
+        save_weights(self.folder / name, self.result, card)
+        return self.folder / name
+
+    def validate(self, log: RunLog) -> None:
+        """Score the present weights and export them if they are the best so far."""
+        if self.validator is None:
+            return
+        if self.fabric.global_rank == 0:
+            start = time.perf_counter()
+            score: Score = self.validator(self.result)
+            better = not math.isnan(score.value) and (self.best is None or score.value > self.best)
+            if better:
+                self.best = score.value
+                self.export(BEST, {"validation": score.table})
+            log.say(f"validation after step {self.step}: {score.text}{'  (best so far)' if better else ''}")
+            log.say(f"  took {duration(time.perf_counter() - start)}")
+            log.record(self.step, {f"validation/{name}": value for name, value in score.scalars.items()})
+        self.fabric.barrier()
+
+    def loop(self, log: RunLog) -> bool:
+        """Train to the end; False where a signal stopped it before."""
+        recipe, clock, waiting = self.recipe, Clock(), Clock()
+        sums: dict[str, Tensor] = {}
+        since, mark = time.perf_counter(), self.step
+        with stopping() as stopped:
+            batches = stream(self.feed, self.step, self.total, recipe.workers)
+            self.module.train()
+            while self.step < self.total and not self.agree(stopped()):
+                with clock.measure("data"):
+                    work = next(batches)
+                losses, lr = self.advance(work, clock)
+                sums = {name: sums.get(name, 0) + value for name, value in losses.items()}
+                log.progress(self.step)
+                if self.step % recipe.log_every == 0 or self.step == self.total:
+                    steps = self.step - mark
+                    means = {name: self.fabric.all_reduce(v / steps).item() for name, v in sums.items()}  # pyright: ignore
+                    log.losses(self.step, means, lr, clock.shares(), (time.perf_counter() - since) / steps)
+                    sums, since, mark = {}, time.perf_counter(), self.step
+                with waiting.measure("other"):
+                    if self.step % recipe.save_every == 0 and self.step < self.total:
+                        self.save()
+                    if recipe.validation and self.step % recipe.validation.every == 0 and self.step < self.total:
+                        self.validate(log)
+                since += waiting.seconds.pop("other")
+        return self.step == self.total
+
+    def agree(self, stop: bool) -> bool:
+        """Whether to stop: where there are several processes they ask each other every 10 steps, to stop together."""
+        if self.fabric.world_size == 1:
+            return stop
+        if self.step % 10:
+            return False
+        return bool(self.fabric.all_reduce(torch.tensor(float(stop), device=self.fabric.device), reduce_op="sum") > 0)  # pyright: ignore
+
+
+@contextmanager
+def stopping() -> Iterator[Callable[[], bool]]:
+    """Turn the first SIGINT or SIGTERM into a flag; a second one acts as usual."""
+    caught: list[int] = []
+    former: dict[int, Any] = {}
+
+    def note(number: int, _: FrameType | None) -> None:
+        caught.append(number)
+        signal.signal(number, former[number])
+
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            former[number] = signal.signal(number, note)
+    except ValueError:  # not in the main thread, where signals do not arrive
+        pass
+    try:
+        yield lambda: bool(caught)
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) -> Outcome:
+    """Train a detector.
+
+    Args:
+        recipe: what to do.
+        data: folder that ``{data}`` stands for in the recipe.
+        out: folder of the run; gets ``last.safetensors`` (to go on from), ``best.safetensors`` and
+            ``final.safetensors`` (weights to use), ``log.jsonl`` and ``tensorboard/``.
+        resume: go on from ``last.safetensors`` instead of starting afresh.
+
+    Raises:
+        BeamboxError: for anything in the recipe, the data or the folder that cannot be used.
+    """
+    if (out / LAST).exists() and not resume:
+        raise BeamboxError(f"{out} holds a run already; go on with it by --resume, or give another --out")
+    if recipe.threads:
+        torch.set_num_threads(recipe.threads)
+    fabric = make_fabric(recipe.precision)
+    run = assemble(recipe, data, out, fabric)
+    if resume:
+        run.restore()
+    log = RunLog(out, run.total, run.step, active=fabric.global_rank == 0)
+    try:
+        introduce(run, log, resume)
+        finished = run.loop(log)
+        run.save()
+        if finished:
+            run.validate(log)
+            run.save()
+            final = run.export(FINAL, {})
+            best = out / BEST
+            log.say(f"finished; weights: {best if run.best is not None else final}")
+            return Outcome(run.step, True, best if run.best is not None else final, run.best)
+        log.say(f"interrupted after step {run.step} of {run.total}; the same command with --resume goes on from there")
+        return Outcome(run.step, False, out / BEST if run.best is not None else None, run.best)
+    finally:
+        log.close()
+
+
+def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric) -> Run:
+    """Build the detector, the stream of batches and the validation that a recipe asks for."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.seed)
+        detector = build(recipe.detector.name, recipe.detector.options)
+    if recipe.detector.start_from:
+        stored = read_weights(recipe.detector.start_from)
+        with torch.no_grad():
+            fill(detector, stored.tensors, recipe.detector.start_from)
+    config = detector.config
+    sources = [open_source(section, data) for section in recipe.data]
+    weights = tuple(section.weight for section in recipe.data if section.weight is not None)
+    draws = Draws(tuple(len(source) for source in sources), weights or None, recipe.seed)
+    change = make_change(recipe, sources, out if fabric.global_rank == 0 else None)
+    feed = Feed(
+        sources,
+        draws,
+        change,
+        config.classes,
+        config.grid,
+        recipe.optim.batch,
+        recipe.window,
+        fabric.global_rank,
+        fabric.world_size,
+    )
+    run = Run(recipe, detector, feed, fabric, out)
+    if recipe.validation:
+        run.validator = Validator(recipe.validation, open_source(recipe.validation.source, data))
+    return run
+
+
+def introduce(run: Run, log: RunLog, resumed: bool) -> None:
+    """Say what is about to happen."""
+    recipe, fabric = run.recipe, run.fabric
+    count = sum(parameter.numel() for parameter in run.detector.parameters())
+    log.say(f"beambox {__version__}: {recipe.name}, seed {recipe.seed}, {count / 1e6:.2f} M parameters")
+    precision = type(fabric.strategy.precision).__name__
+    log.say(
+        f"{fabric.world_size} x {fabric.device.type}, {precision}, {torch.get_num_threads()} threads; "
+        f"{run.feed.draws.epoch_size} frames an epoch, {run.per_epoch:.0f} steps an epoch, {run.total} steps"
+    )
+    if resumed:
+        log.say(f"going on after step {run.step}")

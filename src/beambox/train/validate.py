@@ -1,0 +1,64 @@
+"""Scoring during a run: KITTI's metric on the validation source, and the one number that chooses the best weights."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from beambox.checks import BeamboxError, did_you_mean
+from beambox.data.source import FrameSource
+from beambox.infer.evaluate import score_frames, scored_frames
+from beambox.metrics.kitti_result import KittiResult
+from beambox.train.config import ValidationSection
+
+__all__ = ["Score", "Validator", "summarise"]
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a validation says."""
+
+    value: float
+    """The number that chooses the best weights, percent; NaN where no object was there to find."""
+    text: str
+    """One line for the console."""
+    scalars: dict[str, float]
+    """Numbers for the log."""
+    table: dict[str, Any]
+    """Everything, as ``beambox evaluate --json`` writes it."""
+
+
+class Validator:
+    """Scores a detector on the recipe's validation source."""
+
+    def __init__(self, section: ValidationSection, source: FrameSource) -> None:
+        self.section, self.source = section, source
+
+    def __call__(self, model: Any) -> Score:
+        """Score a detector; its training mode is restored."""
+        classes = model.config.classes
+        if self.section.choose_by != "mean" and self.section.choose_by not in classes:
+            raise BeamboxError(
+                f'validation.choose_by: the detector has no class "{self.section.choose_by}"'
+                f"{did_you_mean(self.section.choose_by, [*classes, 'mean'])}"
+            )
+        frames = scored_frames(model, self.source)
+        return summarise(score_frames(frames, classes, self.section.iou or None), self.section)
+
+
+def summarise(result: KittiResult, section: ValidationSection) -> Score:
+    """Pick the recipe's number out of a result."""
+    level = result.levels.index(section.level) if section.level in result.levels else 0
+    scalars = {}
+    for one in result.classes:
+        averages = (one.box3d if section.view == "3d" else one.bev)[level]
+        value = {"R40": averages.r40, "R11": averages.r11, "all": averages.all_points}[section.recalls]
+        scalars[one.name] = value
+    known = [value for value in scalars.values() if not math.isnan(value)]
+    mean = sum(known) / len(known) if known else math.nan
+    value = mean if section.choose_by == "mean" else scalars[section.choose_by]
+    told = ", ".join(f"{name} {'-' if math.isnan(v) else f'{v:.2f}'}" for name, v in scalars.items())
+    protocol = f"{section.view} {section.recalls} {result.levels[level]}"
+    logged = {name: v for name, v in {**scalars, "mean": mean}.items() if not math.isnan(v)}
+    return Score(value, f"{protocol} {told}, mean {mean:.2f}", logged, result.to_json())
