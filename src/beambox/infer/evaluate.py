@@ -9,15 +9,52 @@ from typing import Any
 
 import torch
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.source import FrameSource
+from beambox.detectors.weights import load_weights
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
 from beambox.structures import Batch, Detections, Frame
 
-__all__ = ["detect_frames", "score_frames", "scored_frames", "write_results"]
+__all__ = ["detect_frames", "detector_for", "parse_overlaps", "score_frames", "scored_frames", "write_results"]
 
 Progress = Callable[[int], None]
+
+
+def detector_for(name: str, device: str = "auto") -> Any:
+    """Load a bare detector (three calls, no reading of files) from a weight file, the folder of a run, or by name.
+
+    Args:
+        name: path of a weight file; folder of a run, whose best weights are taken, else its final ones; or a shipped name.
+        device: ``auto``, ``cpu`` or ``cuda``.
+    """
+    path = Path(name)
+    if path.is_dir():
+        held = [path / file for file in ("best.safetensors", "final.safetensors") if (path / file).is_file()]
+        if not held:
+            raise MissingFileError(
+                f"{path} holds no weights: expected best.safetensors or final.safetensors, which `beambox train` writes "
+                "at its first validation and at its end"
+            )
+        path = held[0]
+    chosen = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    return load_weights(path, chosen)
+
+
+def parse_overlaps(texts: Sequence[str]) -> dict[str, float]:
+    """Read overlaps given as ``Car=0.5``.
+
+    Raises:
+        BeamboxError: quoting what cannot be read.
+    """
+    overlaps = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            overlaps[name] = float(value)
+        except ValueError:
+            raise BeamboxError(f'an overlap is given as CLASS=VALUE, as Car=0.5; got "{text}"') from None
+    return overlaps
 
 
 @torch.inference_mode()

@@ -78,7 +78,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
                     f"{path} holds no state of a training run (format {metadata.get('format', 'unknown')}, expected "
                     f"{FORMAT}); resume from the file last.safetensors of the run's folder"
                 )
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a dict)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except SafetensorError as error:
         raise BeamboxError(f"{path} is damaged or cut short ({error}); resume from another checkpoint") from None
     plain = json.loads(metadata["beambox"])

@@ -1,0 +1,92 @@
+"""A detector and frames small enough that a training step takes milliseconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from beambox.data.source import FrameList
+from beambox.detectors.catalogue import build
+from beambox.structures import Frame, Labels
+from beambox.train.config import Recipe, parse_recipe
+from beambox.train.devices import make_fabric
+from beambox.train.feed import Draws, Feed
+from beambox.train.loop import Run
+
+OPTIONS: dict[str, Any] = {
+    "grid": {"minimum": [0.0, -6.4, -3.0], "maximum": [12.8, 6.4, 1.0], "cell": [0.4, 0.4, 4.0]},
+    "pillar_channels": 4,
+    "depths": [1, 1],
+    "strides": [2, 2],
+    "widths": [8, 8],
+    "up_strides": [1, 2],
+    "up_widths": [8, 8],
+}
+
+
+def frames(count: int, seed: int = 0) -> FrameList:
+    """Return frames of ground and one car each, made of random points."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for number in range(count):
+        centre = np.array([rng.uniform(3, 10), rng.uniform(-4, 4), -1.0])
+        car = centre + rng.uniform(-0.5, 0.5, (60, 3)) * (3.9, 1.6, 1.5)
+        ground = np.column_stack((rng.uniform(0, 12, 200), rng.uniform(-6, 6, 200), np.full(200, -1.75)))
+        points = np.column_stack((np.concatenate((car, ground)), rng.uniform(0, 1, 260)))
+        labels = Labels(torch.tensor([[*centre, 3.9, 1.6, 1.5, 0.0]]), ("Car",))
+        made.append(Frame(torch.tensor(points, dtype=torch.float32), f"{number:06d}", labels))
+    return FrameList(made)
+
+
+def recipe(**optim: Any) -> Recipe:
+    """Return a recipe for the tiny detector."""
+    settings = {"lr": 0.003, "iterations": 6, "batch": 2, **optim}
+    return parse_recipe(
+        {
+            "name": "tiny",
+            "detector": {"name": "pointpillars", "options": OPTIONS},
+            "data": [{"kind": "kitti"}],
+            "optim": settings,
+            "workers": 0,
+            "precision": "float32",
+        }
+    )
+
+
+def shuffled(frame: Frame, rng: np.random.Generator) -> Frame:
+    """Augment: the points in another order, mirrored in half of the cases."""
+    points = frame.points[rng.permutation(len(frame))]
+    assert frame.labels is not None
+    if rng.random() < 0.5:
+        mirror = torch.tensor([1.0, -1.0, 1.0, 1.0])
+        boxes = frame.labels.boxes * torch.tensor([1.0, -1, 1, 1, 1, 1, -1])
+        return Frame(points * mirror, frame.id, frame.labels.with_boxes(boxes))
+    return frame.with_points(points)
+
+
+def tiny_run(
+    folder: Path, made: Recipe | None = None, count: int = 5, window: tuple[int, int] | None = (16, 16)
+) -> Run:
+    """Return a run of the tiny detector that has not begun."""
+    made = made or recipe()
+    torch.manual_seed(made.seed)
+    detector = build(made.detector.name, made.detector.options)
+    fabric = make_fabric(made.precision)
+    source = frames(count)
+    draws = Draws((len(source),), None, made.seed)
+    config = detector.config
+    feed = Feed(
+        [source],
+        draws,
+        shuffled,
+        config.classes,
+        config.grid,
+        made.optim.batch,
+        window,
+        fabric.global_rank,
+        fabric.world_size,
+    )
+    return Run(made, detector, feed, fabric, folder)
