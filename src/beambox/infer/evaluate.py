@@ -25,7 +25,7 @@ def detector_for(name: str, device: str = "auto") -> Any:
     """Load a bare detector (three calls, no reading of files) from a weight file, the folder of a run, or by name.
 
     Args:
-        name: path of a weight file; folder of a run, whose best weights are taken, else its final ones; or a shipped name.
+        name: path of a weight file, or folder of a run, whose best weights are taken, else its final ones.
         device: ``auto``, ``cpu`` or ``cuda``.
     """
     path = Path(name)
@@ -33,8 +33,8 @@ def detector_for(name: str, device: str = "auto") -> Any:
         held = [path / file for file in ("best.safetensors", "final.safetensors") if (path / file).is_file()]
         if not held:
             raise MissingFileError(
-                f"{path} holds no weights: expected best.safetensors or final.safetensors, which `beambox train` writes "
-                "at its first validation and at its end"
+                f"{path} holds no weights: expected best.safetensors or final.safetensors, which `beambox train` "
+                "writes at its first validation and at its end"
             )
         path = held[0]
     chosen = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device

@@ -19,7 +19,6 @@ from beambox import __version__
 from beambox.checks import BeamboxError
 from beambox.detectors.catalogue import build, config_to_dict, name_of
 from beambox.detectors.weights import fill, read_weights, save_weights
-from beambox.layers.bev import BevBackbone
 from beambox.train.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -92,7 +91,7 @@ class Run:
         self.names = {parameter: name for name, parameter in detector.named_parameters()}
         if recipe.compile:
             for layer in detector.modules():
-                if isinstance(layer, BevBackbone):
+                if type(layer).__name__ == "BevBackbone":
                     layer.compile()
 
     @property
