@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import pytest
 import torch
 import torch.nn.functional as F
@@ -43,6 +44,13 @@ INPUTS = [  # density, batch size, channels in and out
 TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
 
 
+@pytest.fixture(params=["reference", "numba"])
+def backend(request, monkeypatch):
+    """Run with each backend in turn."""
+    monkeypatch.setenv("BEAMBOX_BACKEND", request.param)
+    return request.param
+
+
 def close(ours: torch.Tensor, theirs: torch.Tensor) -> None:
     scale = max(1.0, float(theirs.detach().abs().max())) if theirs.numel() else 1.0
     torch.testing.assert_close(ours, theirs, rtol=0, atol=TOLERANCE[theirs.dtype] * scale)
@@ -74,7 +82,7 @@ def parameters(kernel, c_in, c_out, dtype):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize(("density", "batch", "c_in", "c_out"), INPUTS)
 @pytest.mark.parametrize(("kernel", "stride", "padding", "dilation"), STRIDED)
-def test_sparse_conv_matches_dense(kernel, stride, padding, dilation, density, batch, c_in, c_out, dtype):
+def test_sparse_conv_matches_dense(backend, kernel, stride, padding, dilation, density, batch, c_in, c_out, dtype):
     x = random_sparse(1, (7, 9, 8), batch, density, c_in, dtype)
     weight, bias = parameters(kernel, c_in, c_out, dtype)
     compare(
@@ -89,7 +97,7 @@ def test_sparse_conv_matches_dense(kernel, stride, padding, dilation, density, b
 @pytest.mark.parametrize(("density", "batch", "c_in", "c_out"), INPUTS)
 @pytest.mark.parametrize(("kernel", "stride", "padding", "dilation"), STRIDED)
 def test_sparse_conv_activates_exactly_what_an_active_input_reaches(
-    kernel, stride, padding, dilation, density, batch, c_in, c_out
+    backend, kernel, stride, padding, dilation, density, batch, c_in, c_out
 ):
     x = random_sparse(2, (7, 9, 8), batch, density, 1)
     occupied = x.with_features(torch.ones_like(x.features)).to_dense()
@@ -102,7 +110,7 @@ def test_sparse_conv_activates_exactly_what_an_active_input_reaches(
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize(("density", "batch", "c_in", "c_out"), INPUTS)
 @pytest.mark.parametrize(("kernel", "dilation"), CENTRED)
-def test_submanifold_conv_matches_dense(kernel, dilation, density, batch, c_in, c_out, dtype):
+def test_submanifold_conv_matches_dense(backend, kernel, dilation, density, batch, c_in, c_out, dtype):
     x = random_sparse(3, (7, 9, 8), batch, density, c_in, dtype)
     weight, bias = parameters(kernel, c_in, c_out, dtype)
     padding = tuple(d * (k // 2) for k, d in zip(kernel, dilation))
@@ -117,7 +125,7 @@ def test_submanifold_conv_matches_dense(kernel, dilation, density, batch, c_in, 
 
 
 @pytest.mark.parametrize(("kernel", "stride", "padding", "dilation"), STRIDED)
-def test_inverse_conv_matches_dense_transposed_conv(kernel, stride, padding, dilation):
+def test_inverse_conv_matches_dense_transposed_conv(backend, kernel, stride, padding, dilation):
     fine = random_sparse(4, (7, 9, 8), 2, 0.2, 3)
     weight, bias = parameters(kernel, 5, 4, torch.float64)
     coarse_sites = kernel_map(fine.sites, Geometry(kernel, stride, padding, dilation)).target
@@ -150,7 +158,7 @@ def test_layers_on_the_same_sites_share_one_map():
 
 
 @pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
-def test_empty_samples_give_what_dense_gives(empty):
+def test_empty_samples_give_what_dense_gives(backend, empty):
     x = random_sparse(8, empty=empty)
     weight, bias = parameters((3, 3, 3), 3, 4, torch.float64)
     out = sparse_conv3d(x, weight, bias, (2, 2, 2), (1, 1, 1))
@@ -222,3 +230,39 @@ def test_height_chain_of_the_eightfold_backbone(shape, chain):
         shape = geometry.output_shape(shape)
         heights.append(shape[0])
     assert heights == chain
+
+
+def many_threads_agree(repetitions: int) -> None:
+    """Run one network's worth of layers again and again on 1, 2 and 4 threads and compare every bit."""
+    x = random_sparse(11, (11, 40, 40), 2, 0.1, 16, torch.float32)
+    weights = [parameters(k, i, o, torch.float32) for k, i, o in (((3, 3, 3), 16, 32), ((3, 3, 3), 32, 20))]
+
+    def run():
+        leaves = [x.features.clone().requires_grad_(), *(w.clone().requires_grad_() for pair in weights for w in pair)]
+        fresh = SparseTensor.of(leaves[0], x.indices, x.shape, x.batch_size)
+        out = sparse_conv3d(fresh, leaves[1], leaves[2], (2, 2, 2), (1, 1, 1))
+        out = submanifold_conv3d(out, leaves[3], leaves[4])
+        grads = torch.autograd.grad((out.features**2).sum(), leaves)
+        return [out.features.detach(), out.indices, *grads]
+
+    before = torch.get_num_threads(), numba.get_num_threads()
+    try:
+        first = run()
+        for repetition in range(repetitions):
+            threads = (1, 2, 4)[repetition % 3]
+            torch.set_num_threads(threads)
+            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+            for expected, found in zip(first, run()):
+                assert expected.equal(found)
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+
+
+def test_bits_do_not_depend_on_threads():
+    many_threads_agree(6)
+
+
+@pytest.mark.slow
+def test_bits_do_not_depend_on_threads_in_200_repetitions():
+    many_threads_agree(200)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
+from beambox.ops.dispatch import Backend, always, can_run_numba, choose
 from beambox.ops.sparse_conv import reference
 from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple
 from beambox.ops.sparse_conv.tensor import SparseTensor
@@ -21,6 +24,26 @@ __all__ = [
 ]
 
 
+def _cpu() -> ModuleType:
+    from beambox.ops.sparse_conv import cpu
+
+    return cpu
+
+
+BACKENDS = (
+    Backend("numba", can_run_numba, lambda: _cpu().convolve),
+    Backend("reference", always, lambda: reference.convolve),
+)
+TARGET_BACKENDS = (
+    Backend("numba", can_run_numba, lambda: _cpu().find_targets),
+    Backend("reference", always, lambda: reference.find_targets),
+)
+TABLE_BACKENDS = (
+    Backend("numba", can_run_numba, lambda: _cpu().neighbour_table),
+    Backend("reference", always, lambda: reference.neighbour_table),
+)
+
+
 def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
     """Return the map of a convolution from these sites, found once and kept with them."""
     known = sites.maps.get(geometry)
@@ -29,9 +52,10 @@ def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
     if geometry.submanifold:
         target = sites
     else:
-        keys = reference.find_targets(sites, geometry)
+        keys = choose("find_targets", TARGET_BACKENDS, sites.indices)(sites, geometry)
         target = Sites.from_keys(keys, geometry.output_shape(sites.shape), sites.batch_size)
-    found = KernelMap(sites, target, geometry, reference.neighbour_table(sites, target, geometry))
+    table = choose("neighbour_table", TABLE_BACKENDS, sites.indices)(sites, target, geometry)
+    found = KernelMap(sites, target, geometry, table)
     sites.maps[geometry] = found
     return found
 
@@ -52,7 +76,7 @@ def submanifold_conv3d(
     """
     _check_weight(x, weight)
     found = kernel_map(x.sites, Geometry.centred(_kernel(weight), dilation))
-    return SparseTensor(reference.convolve(x.features, weight.flatten(0, 2), bias, found), found.target)
+    return SparseTensor(_convolve(x.features, weight, bias, found), found.target)
 
 
 def sparse_conv3d(
@@ -78,7 +102,7 @@ def sparse_conv3d(
     """
     _check_weight(x, weight)
     found = kernel_map(x.sites, Geometry(_kernel(weight), stride, padding, dilation))
-    return SparseTensor(reference.convolve(x.features, weight.flatten(0, 2), bias, found), found.target)
+    return SparseTensor(_convolve(x.features, weight, bias, found), found.target)
 
 
 def inverse_conv3d(
@@ -115,7 +139,7 @@ def inverse_conv3d(
             f"`x` must stand at the {len(found.target)} sites of {found.target.shape} that this convolution makes of "
             f"`onto`, got {len(x.sites)} sites of {x.shape}; give the same kernel, stride, padding and dilation"
         )
-    return SparseTensor(reference.convolve(x.features, weight.flatten(0, 2), bias, found.inverse), onto)
+    return SparseTensor(_convolve(x.features, weight, bias, found.inverse), onto)
 
 
 def _kernel(weight: Tensor) -> Triple:
@@ -125,3 +149,8 @@ def _kernel(weight: Tensor) -> Triple:
 
 def _check_weight(x: SparseTensor, weight: Tensor) -> None:
     expect_shape("weight", weight, ("kz", "ky", "kx", x.channels, "C_out"))
+
+
+def _convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
+    tensors = (features, weight) if bias is None else (features, weight, bias)
+    return choose("sparse_conv", BACKENDS, *tensors)(features, weight.flatten(0, 2), bias, pairs)

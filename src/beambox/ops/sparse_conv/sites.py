@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
+
+if TYPE_CHECKING:
+    from beambox.ops.sparse_conv.cpu import BlockPairs
 
 __all__ = ["Geometry", "KernelMap", "Sites", "Triple"]
 
@@ -77,7 +81,7 @@ class Geometry:
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KernelMap:
     """Which input site feeds which output site through which kernel offset."""
 
@@ -96,6 +100,13 @@ class KernelMap:
         """The same pairs read from output to input: the map of the transposed convolution and of gradients."""
         return self.mirror or KernelMap(self.target, self.source, self.geometry, self._transposed_table(), self)
 
+    @cached_property
+    def blocks(self) -> BlockPairs:
+        """The same pairs grouped as the CPU works on them."""
+        from beambox.ops.sparse_conv.cpu import group_pairs
+
+        return group_pairs(self.table)
+
     def _transposed_table(self) -> Tensor:
         if self.geometry.submanifold:
             return self.table.flip(1).contiguous()  # a centred kernel mirrors itself
@@ -105,7 +116,7 @@ class KernelMap:
         return back
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sites:
     """Where a sparse tensor is active. :meth:`of` checks; the bare constructor trusts.
 
@@ -122,7 +133,7 @@ class Sites:
     """``(V,)`` int64 linear positions ``((b Z + z) Y + y) X + x``, ascending."""
     order: Tensor
     """``(V,)`` int64 row in ``indices`` of each sorted key."""
-    maps: dict[Geometry, KernelMap] = field(default_factory=dict, repr=False, compare=False)
+    maps: dict[Geometry, KernelMap] = field(default_factory=dict, repr=False)
     """Kernel maps found so far."""
 
     def __len__(self) -> int:
