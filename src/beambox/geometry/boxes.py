@@ -99,7 +99,7 @@ def corners_bev(boxes: Tensor) -> Tensor:
 
 
 def axis_aligned_bev(boxes: Tensor) -> Tensor:
-    """Return the nearest axis-aligned rectangle of each box (spec 2.4: length and width swap from 45 degrees on).
+    """Return the nearest axis-aligned rectangle of each box (length and width swap from 45 degrees on).
 
     Args:
         boxes: ``(N, 7)``.

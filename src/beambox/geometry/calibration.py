@@ -1,4 +1,4 @@
-"""KITTI's calibration: LiDAR, rectified camera and image, and boxes between them (spec 1.1, 1.2)."""
+"""KITTI's calibration: LiDAR, rectified camera and image, and boxes between them."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Calibration:
     def rect_to_image(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
         """Project ``(N, 3)`` rect points: ``(N, 2)`` pixels u, v and ``(N,)`` depth in metres.
 
-        u and v are divided by rect's z, as the public toolbox does (spec 1.2).
+        u and v are divided by rect's z, as the public toolbox does.
         """
         projected = xyz.double() @ self.p2[:, :3].T + self.p2[:, 3]  # (N, 3)
         return projected[:, :2] / xyz[:, 2:3].double(), projected[:, 2] - self.p2[2, 3]

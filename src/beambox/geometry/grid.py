@@ -16,7 +16,7 @@ __all__ = ["VoxelGrid"]
 class VoxelGrid:
     """Cells of one size over an axis-aligned box, in the LiDAR frame.
 
-    The region is half open: a point is inside iff ``0 <= floor((p - minimum) / cell) < size`` on all axes (spec 2.1).
+    The region is half open: a point is inside iff ``0 <= floor((p - minimum) / cell) < size``.
     Indices are ordered (z, y, x), sizes and positions (x, y, z).
     """
 
@@ -72,7 +72,7 @@ class VoxelGrid:
         return (index.flip(-1) + 0.5) * cell + minimum
 
     def contains(self, centres: Tensor) -> Tensor:
-        """Tell which ``(N, 3 or more)`` positions lie in the closed region (spec 2.1: boxes of training)."""
+        """Tell which ``(N, 3 or more)`` positions lie in the closed region."""
         low, high = centres.new_tensor(self.minimum), centres.new_tensor(self.maximum)
         return ((centres[:, :3] >= low) & (centres[:, :3] <= high)).all(dim=1)
 

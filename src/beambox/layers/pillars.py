@@ -50,8 +50,13 @@ class PillarFeatures(nn.Module):
         features = segment_max(functional.relu(lifted), voxels.voxel, len(voxels.index))  # (V, channels)
         if self.empty_slots is None:
             return features
-        shift = self.norm.bias - self.norm.running_mean * self.norm.weight / torch.sqrt(
-            self.norm.running_var + self.norm.eps  # pyright: ignore[reportOperatorIssue, reportOptionalOperand]
-        )
-        padded = torch.maximum(features, functional.relu(shift).to(features.dtype))
+        of_zero = functional.batch_norm(
+            features.new_zeros(1, features.shape[1]),
+            self.norm.running_mean,
+            self.norm.running_var,
+            self.norm.weight,
+            self.norm.bias,
+            eps=self.norm.eps,
+        )  # (1, channels): what an empty place gives
+        padded = torch.maximum(features, functional.relu(of_zero))
         return torch.where((voxels.count < self.empty_slots)[:, None], padded, features)

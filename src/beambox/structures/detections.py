@@ -63,7 +63,7 @@ class Detections:
         return replace(self, boxes=self.boxes.to(device), scores=self.scores.to(device), labels=self.labels.to(device))
 
     def to_kitti(self, calibration: Calibration, image_size: tuple[int, int] | None = None) -> str:
-        """Write KITTI's result lines (spec 1.2), one a detection, in order.
+        """Write KITTI's result lines, one a detection, in order.
 
         Args:
             calibration: of the frame; KITTI's boxes live in its camera.

@@ -51,7 +51,7 @@ class Frame:
         return replace(self, points=points)
 
     def camera_view(self) -> Frame:
-        """Keep only the points that the camera sees (KITTI labels exist only there; spec 1.2).
+        """Keep only the points that the camera sees (KITTI labels exist only there).
 
         Raises:
             BeamboxError: without a calibration or an image size.

@@ -39,11 +39,12 @@ class ImageAttributes:
 
     def __getitem__(self, index: Tensor | slice) -> ImageAttributes:
         camera = None if self.camera is None else self.camera[index]
-        columns = (self.truncation, self.occlusion, self.alpha, self.image)
-        return ImageAttributes(*(column[index] for column in columns), camera)
+        return ImageAttributes(
+            self.truncation[index], self.occlusion[index], self.alpha[index], self.image[index], camera
+        )
 
     def difficulty(self) -> Tensor:
-        """KITTI's level of each object, ``(N,)`` int64: 0 easy, 1 moderate, 2 hard, -1 beyond hard (spec 1.2)."""
+        """KITTI's level of each object, ``(N,)`` int64: 0 easy, 1 moderate, 2 hard, -1 beyond hard (the devkit)."""
         height = self.image[:, 3] - self.image[:, 1] + 1
         level = torch.full((len(self.image),), -1)
         for rank, (tall, cut, hidden) in reversed(list(enumerate(((40, 0.15, 0), (25, 0.30, 1), (25, 0.50, 2))))):
