@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import functools
+import inspect
+import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -14,7 +16,10 @@ from beambox.checks import BeamboxError, did_you_mean
 __all__ = ["COMMANDS", "main"]
 
 # name -> (module whose `command` function it is, what it does in one line)
-COMMANDS: dict[str, tuple[str, str]] = {}
+COMMANDS: dict[str, tuple[str, str]] = {
+    "detect": ("beambox.cli.detect", "find objects in sweeps: files, folders, patterns"),
+    "show": ("beambox.cli.show", "draw sweeps from above, with boxes, and the boxes into the camera image"),
+}
 
 EXAMPLES = (
     ("beambox demo", "simulate, detect, score and draw: needs nothing but this package"),
@@ -115,8 +120,14 @@ def run(name: str, arguments: Sequence[str]) -> None:
         module = import_module(COMMANDS[name][0])
     except KeyboardInterrupt:
         stop("interrupted", 130)
-    app.command(name, context_settings=settings)(guard(module.command))
+    app.command(name, help=help_of(module.command), context_settings=settings)(guard(module.command))
     app(args=list(arguments), prog_name=f"beambox {name}")
+
+
+def help_of(function: Callable[..., None]) -> str:
+    """Return a command's docstring with its examples marked as lines that are not to be joined."""
+    text = inspect.cleandoc(function.__doc__ or "")
+    return re.sub(r"(?m)(?<!\x08\n)^Examples:$", "\b\nExamples:", text)
 
 
 if __name__ == "__main__":

@@ -74,7 +74,9 @@ def region_of(frame: Frame, boxes: torch.Tensor | None = None, reach: float = 80
         centres = centres[(np.abs(centres) <= reach).all(axis=1)]
         if len(centres):
             low, high = np.minimum(low, centres.min(axis=0) - 3), np.maximum(high, centres.max(axis=0) + 3)
-    low, high = np.floor(low / 5) * 5, np.ceil(high / 5) * 5
+    low, high = np.floor(low / 5 - 0.2) * 5, np.ceil(high / 5) * 5
+    narrow = max(0.0, 0.8 * (high[0] - low[0]) - (high[1] - low[1]))  # a street seen ahead would make a ribbon
+    low[1], high[1] = low[1] - narrow / 2, high[1] + narrow / 2
     return Region(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
@@ -84,6 +86,7 @@ def draw_bev(
     labels: Labels | None = None,
     *,
     region: Region | None = None,
+    looked_at: Region | None = None,
     colour_by: ColourBy = "height",
     title: str = "",
     longest: int = 1200,
@@ -95,6 +98,7 @@ def draw_bev(
         detections: drawn in the colour of their class, the surer the brighter, with their score.
         labels: the truth, drawn in green; dashed where detections are shown too.
         region: metres to show; chosen from the points where None.
+        looked_at: the detector's region, drawn as a thin dashed line.
         colour_by: what the points' colours say.
         title: first line of the legend; the frame's name where empty.
         longest: pixels of the map's longer edge.
@@ -111,6 +115,8 @@ def draw_bev(
     canvas = Canvas(width + PANEL_WIDTH, height, BACKGROUND)
     limits = _draw_points(canvas, view, frame, colour_by)
     _draw_rings(canvas, view)
+    if looked_at is not None:
+        _draw_border(canvas, view, looked_at)
     tags = _Tags(canvas, width, height, _outline(view, torch.cat(boxes)) if boxes else None)
     if detections is not None:
         _draw_detections(canvas, view, detections)
@@ -157,6 +163,12 @@ def _draw_rings(canvas: Canvas, view: _Map) -> None:
             canvas.text((u + 4, at), f"{distance} m", MUTED, size=11, behind=BACKGROUND)
     nose, left, right = (u, v - 9), (u - 6, v + 6), (u + 6, v + 6)
     canvas.polygon((nose, left, (u, v + 3), right), TEXT)
+
+
+def _draw_border(canvas: Canvas, view: _Map, looked_at: Region) -> None:
+    x0, y0, x1, y1 = looked_at.x_min, looked_at.y_min, looked_at.x_max, looked_at.y_max
+    corners = view.pixels(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]))
+    canvas.dashes([(float(u), float(v)) for u, v in corners], MUTED, width=0.75, dash=5)
 
 
 def _outline(view: _Map, boxes: torch.Tensor) -> NDArray[np.float64]:

@@ -1,1 +1,12 @@
-"""beambox.zoo."""
+"""The shipped weights: one .safetensors file each, with its card inside and, for readers, beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["shipped"]
+
+
+def shipped() -> dict[str, Path]:
+    """Return the file of each shipped set of weights, by name."""
+    return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.safetensors"))}

@@ -1,0 +1,133 @@
+"""`beambox detect`: boxes for every sweep that is named."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from beambox.checks import BeamboxError
+from beambox.cli import options
+from beambox.cli.console import announce, progress, say, show_log
+
+if TYPE_CHECKING:
+    from beambox.infer.inputs import Sweep
+    from beambox.infer.predictor import Detector
+    from beambox.structures import Detections
+
+__all__ = ["command"]
+
+
+def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+    inputs: options.InputsArgument,
+    model: options.ModelOption,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
+        "detections"
+    ),
+    formats: Annotated[str, typer.Option("--format", "-f", metavar="F", help="json, csv, kitti, or several.")] = "json",
+    min_score: options.MinScoreOption = 0.0,
+    range_: options.RangeOption = "",
+    view: options.ViewOption = "auto",
+    sensor_height: options.HeightOption = None,
+    axes: options.AxesOption = "",
+    intensity_scale: options.IntensityOption = None,
+    fields: options.FieldsOption = "",
+    device: options.DeviceOption = "auto",
+    precision: options.PrecisionOption = "auto",
+) -> None:
+    """Find objects in sweeps; writes one result file a sweep.
+
+    Examples:
+      beambox detect scan.bin --model pointpillars-sim
+      beambox detect kitti/training/velodyne --model run/best.safetensors --format kitti --out results
+      beambox detect "drive/*.pcd" -m pointpillars-sim --range 50 --sensor-height 1.9 --axes "x: right, y: forward"
+
+    Boxes are x y z l w h yaw in the sweep's own frame: centre, metres, radians counter-clockwise from +x. KITTI's
+    format needs the sweep's calibration, found as ../calib/ID.txt beside velodyne/ID.bin. Nothing found at all?
+    `beambox doctor scan.bin --model M` says why.
+    """
+    from beambox.infer.inputs import find_sweeps
+    from beambox.infer.predictor import load
+    from beambox.infer.results import choose_formats
+
+    show_log()
+    kinds = choose_formats(formats)
+    sweeps = find_sweeps(inputs)
+    if "kitti" in kinds:
+        need_calibration(sweeps)
+    detector = load(
+        model,
+        device=device,
+        precision=precision,
+        range=options.parse_range(range_),
+        view=view,  # pyright: ignore[reportArgumentType]  # load checks it
+        sensor_height=sensor_height,
+        axes=axes or None,
+        intensity_scale=intensity_scale,
+        fields=fields or None,
+    )
+    announce("detect", detail=f"{model} on {detector.device} in {str(detector.dtype).removeprefix('torch.')}")
+    detect_all(detector, sweeps, out, kinds, model, min_score)
+
+
+def detect_all(
+    detector: Detector, sweeps: list[Sweep], out: Path, kinds: list[str], model: str, min_score: float
+) -> None:
+    """Detect and write, sweep after sweep; one that cannot be read does not keep the others from being done."""
+    from beambox.infer.results import write_results
+
+    start, failed, found, told = time.perf_counter(), 0, 0, False
+    for sweep in progress(sweeps, len(sweeps), "Detecting"):
+        try:
+            frame = detector.read(sweep)
+        except BeamboxError as error:
+            if len(sweeps) == 1:
+                raise
+            say(f"beambox: skipped: {error}")
+            failed += 1
+            continue
+        if detector.sees_camera_only(frame) and not told:
+            say("points outside the camera's view are left out (calib found; --view full keeps them)")
+            told = True
+        for note in frame.notes:
+            say(f"{sweep.name}: {note}")
+        detections = detector.detect([frame])[0]
+        detections = detections[detections.scores >= min_score]
+        written = write_results(out, frame, detections, kinds, model, sweep.name)
+        found += len(detections)
+        print(f"{sweep.name}: {counted(detections)} -> {', '.join(str(path) for path in written)}")
+    seconds = time.perf_counter() - start
+    say(f"{len(sweeps) - failed} sweeps, {found} detections, {seconds:.1f} s")
+    if not found and not failed:
+        say(f"nothing found; `beambox doctor {sweeps[0].path} --model {model}` says why")
+    if failed:
+        raise BeamboxError(f"{failed} of {len(sweeps)} sweeps could not be read; the others are done")
+
+
+def counted(detections: Detections) -> str:
+    """Say what was found in a few words."""
+    if not len(detections):
+        return "no detections"
+    counts = Counter(detections.names)
+    words = [f"{counts[name]} {name}" for name in detections.classes if counts[name]]
+    return f"{', '.join(words)}, best score {float(detections.scores.max()):.2f}"
+
+
+def need_calibration(sweeps: list[Sweep]) -> None:
+    """Refuse KITTI's format before the work starts where a sweep has no calibration.
+
+    Raises:
+        BeamboxError: naming the first such sweep.
+    """
+    from beambox.infer.inputs import calibration_beside
+
+    lacking = [sweep for sweep in sweeps if calibration_beside(sweep.path) is None]
+    if lacking:
+        path = lacking[0].path
+        raise BeamboxError(
+            f"{path} has no calibration ({path.parent.parent / 'calib' / (path.stem + '.txt')}), and KITTI's format "
+            "holds boxes in the camera's frame; write --format json or csv instead"
+        )

@@ -1,0 +1,79 @@
+"""Options that several commands share, with one wording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from beambox.checks import BeamboxError
+
+__all__ = [
+    "AxesOption",
+    "DeviceOption",
+    "FieldsOption",
+    "HeightOption",
+    "InputsArgument",
+    "IntensityOption",
+    "MinScoreOption",
+    "ModelOption",
+    "PrecisionOption",
+    "RangeOption",
+    "ViewOption",
+    "parse_range",
+]
+
+InputsArgument = Annotated[list[str], typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns.")]
+ModelOption = Annotated[
+    str, typer.Option("--model", "-m", metavar="M", help="Shipped name, .safetensors file, or folder of a run.")
+]
+DeviceOption = Annotated[str, typer.Option(help="cpu, cuda, cuda:0; auto takes the GPU where there is one.")]
+PrecisionOption = Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16.")]
+RangeOption = Annotated[
+    str,
+    typer.Option(
+        "--range",
+        metavar="R",
+        help="Look elsewhere than in training: 50 for 50 m all around, or x0,y0,x1,y1 in metres.",
+    ),
+]
+ViewOption = Annotated[
+    str, typer.Option(help="camera keeps what the camera sees, full keeps all points; auto: camera where a calib is.")
+]
+HeightOption = Annotated[
+    float | None,
+    typer.Option(
+        "--sensor-height", metavar="H", help="Metres of your sensor above the ground; 0 if z = 0 is the ground."
+    ),
+]
+AxesOption = Annotated[str, typer.Option(metavar="A", help='Where your x and y lead, such as "x: right, y: forward".')]
+IntensityOption = Annotated[
+    float | None,
+    typer.Option("--intensity-scale", metavar="F", help="Factor that brings intensity to 0..1, e.g. 0.01."),
+]
+FieldsOption = Annotated[
+    str,
+    typer.Option(metavar="F", help="Columns of .bin and .npy files, such as x,y,z,intensity,ring; _ leaves one out."),
+]
+MinScoreOption = Annotated[
+    float, typer.Option("--min-score", metavar="S", help="Leave out detections below this score.")
+]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+
+
+def parse_range(text: str, option: str = "--range") -> float | list[float] | None:
+    """Read the value of --range, or of another option that takes a region.
+
+    Raises:
+        BeamboxError: if it is neither one number nor four.
+    """
+    if not text:
+        return None
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 4):
+        raise BeamboxError(f'{option} takes one number, or four as x0,y0,x1,y1 in metres, got "{text}"')
+    return numbers[0] if len(numbers) == 1 else numbers

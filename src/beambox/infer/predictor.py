@@ -1,0 +1,298 @@
+"""A trained network that takes what a user has and returns boxes: ``detector = load(name); detector("scan.bin")``."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.data.reading import points_from_array
+from beambox.detectors.weights import load_weights, read_weights
+from beambox.geometry import VoxelGrid
+from beambox.infer.corrections import Axes, Corrections
+from beambox.infer.fusion import fold_batch_norms
+from beambox.infer.inputs import Sweep, read_sweep
+from beambox.infer.precision import choose_device, choose_precision
+from beambox.structures import Batch, Detections, Frame
+from beambox.zoo import shipped
+
+__all__ = ["Detector", "Input", "View", "find_weights", "load", "region"]
+
+log = logging.getLogger("beambox")
+
+Input = str | Path | np.ndarray | Tensor | Frame
+View = Literal["auto", "camera", "full"]
+VIEWS = ("auto", "camera", "full")
+
+KITTI_SENSOR_HEIGHT = 1.73
+"""Metres above the ground of KITTI's Velodyne; taken where a card does not say otherwise."""
+STRIDE = 8
+"""Regions are rounded to this many cells, the coarsest step of the networks' backbones."""
+
+
+class Detector:
+    """A network for inference with everything around it: reading, corrections, precision, boxes in the given frame."""
+
+    def __init__(
+        self,
+        model: nn.Module,
+        *,
+        card: Mapping[str, Any] | None = None,
+        device: str | torch.device | None = None,
+        precision: str = "auto",
+        grid: VoxelGrid | None = None,
+        view: View = "auto",
+        corrections: Corrections | None = None,
+        intensity_scale: float | None = None,
+        fields: str | Sequence[str] | None = None,
+        batch_size: int = 1,
+    ) -> None:
+        """Prepare a model: batch norms folded, channels last, on its device.
+
+        Args:
+            model: a detector of the catalogue; it is copied, not changed.
+            card: what is known of its weights.
+            device: "cpu", "cuda", ...; None takes the GPU where there is one.
+            precision: "auto", "float32", "bfloat16" or "float16".
+            grid: region to look at, with cells of the model's size; the model's own where None.
+            view: "camera" keeps the points that the camera sees (KITTI's labels exist only there), "full" keeps all;
+                "auto" is "camera" for a sweep with a calibration where the network looks ahead only.
+            corrections: of another sensor's points.
+            intensity_scale: factor that brings the intensity to [0, 1]; found from the numbers where None.
+            fields: names of the columns of files that do not name them.
+            batch_size: sweeps that go through the network together when a list is given.
+        """
+        if view not in VIEWS:
+            raise BeamboxError(f'unknown view "{view}"{did_you_mean(view, VIEWS)}')
+        self.device = choose_device(device)
+        self.dtype = choose_precision(precision, self.device)
+        self.card = dict(card or {})
+        self.config = model.config
+        self.grid = grid or model.config.grid
+        self.view: View = view
+        self.corrections = corrections or Corrections()
+        self.intensity_scale = intensity_scale
+        self.fields = fields
+        self.batch_size = batch_size
+        folded = fold_batch_norms(model.eval()).to(self.device)
+        self.model: Any = folded.to(memory_format=torch.channels_last)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of what it finds."""
+        return self.config.classes
+
+    @overload
+    def __call__(self, given: Input) -> Detections: ...
+    @overload
+    def __call__(self, given: Sequence[Input]) -> list[Detections]: ...
+    def __call__(self, given: Input | Sequence[Input]) -> Detections | list[Detections]:
+        """Detect.
+
+        Args:
+            given: a path; an ``(N, 4 or more)`` array or tensor of x, y, z in metres (x forward, y left, z up) and
+                intensity in [0, 1]; a :class:`Frame`; or a list of these.
+
+        Returns:
+            The detections, best first, on the CPU, in the frame of the points as given; a list for a list.
+
+        Raises:
+            BeamboxError: if something cannot be read or is no point cloud.
+        """
+        if isinstance(given, list | tuple):
+            found: list[Detections] = []
+            for start in range(0, len(given), self.batch_size):
+                found += self.detect([self.read(one) for one in given[start : start + self.batch_size]])
+            return found
+        return self.detect([self.read(given)])[0]
+
+    def read(self, given: Input | Sweep) -> Frame:
+        """Turn any input into a frame; nothing is corrected yet."""
+        scale = self.intensity_scale
+        if isinstance(given, str | Path | Sweep):
+            frame = read_sweep(given, fields=self.fields, intensity_scale=scale)
+        elif isinstance(given, np.ndarray | Tensor):
+            points, notes = points_from_array(given, scale)
+            frame = Frame(points, notes=notes)
+        elif isinstance(given, Frame):
+            if scale is None:
+                return given
+            brighter = given.points.clone()
+            brighter[:, 3] *= scale
+            return given.with_points(brighter)
+        else:
+            raise BeamboxError(
+                "a detector takes a path, an (N, 4) array or tensor, a Frame, or a list of these; "
+                f"got {type(given).__name__}"
+            )
+        for note in frame.notes:
+            log.info("%s: %s", frame.id or "array", note)
+        return frame
+
+    def prepare(self, frame: Frame) -> Frame:
+        """Crop to the view, correct, and keep the columns the network takes."""
+        frame = self.corrections.apply(self.crop(frame))
+        inside = self.grid.index(frame.points)[1]
+        if len(frame) and not bool(inside.any()):
+            log.warning(
+                "%s: none of its %d points lies in the region the network looks at; beambox doctor says why",
+                frame.id or "sweep",
+                len(frame),
+            )
+        return frame
+
+    def crop(self, frame: Frame) -> Frame:
+        """Drop the points outside the camera's view where only that is looked at."""
+        return frame.camera_view() if self.sees_camera_only(frame) else frame
+
+    def sees_camera_only(self, frame: Frame) -> bool:
+        """Whether points outside the camera's view are dropped."""
+        if self.view == "auto":
+            return frame.calibration is not None and frame.image_size is not None and self.grid.minimum[0] >= 0
+        return self.view == "camera"
+
+    @torch.inference_mode()
+    def detect(self, frames: Sequence[Frame]) -> list[Detections]:
+        """Detect in frames that pass through the network together."""
+        batch = Batch.of([self.prepare(frame) for frame in frames])
+        return self.finish(self.predict(batch.to(self.device)), frames)
+
+    @torch.inference_mode()
+    def predict(self, batch: Batch) -> Any:
+        """Run the network on a prepared batch that lies on its device."""
+        lower = self.dtype != torch.float32
+        with torch.autocast(self.device.type, dtype=self.dtype if lower else torch.bfloat16, enabled=lower):
+            return self.model(batch, self.grid)
+
+    @torch.inference_mode()
+    def finish(self, predictions: Any, frames: Sequence[Frame]) -> list[Detections]:
+        """Decode, and carry the boxes into the frame of the points as given."""
+        decoded = self.model.decode(predictions)
+        return [
+            self.corrections.carry_back(replace(found.to("cpu"), frame_id=frame.id))
+            for found, frame in zip(decoded, frames)
+        ]
+
+
+def region(model_grid: VoxelGrid, wanted: float | Sequence[float] | VoxelGrid) -> VoxelGrid:
+    """Choose another region for a network: same cells, same heights, whole steps of its backbone.
+
+    Args:
+        model_grid: what it was trained on.
+        wanted: a number r (from -r to r ahead and to the sides: 360 degrees), or x_min, y_min, x_max, y_max in metres,
+            or a grid.
+
+    Raises:
+        BeamboxError: if the region is empty or not four numbers, or a grid's cells differ from the model's.
+    """
+    if isinstance(wanted, VoxelGrid):
+        if any(abs(a - b) > 1e-9 for a, b in zip(wanted.cell, model_grid.cell)):
+            raise BeamboxError(f"the region needs cells of {model_grid.cell} m as in training, got {wanted.cell}")
+        return wanted
+    numbers = [-wanted, -wanted, wanted, wanted] if isinstance(wanted, int | float) else list(wanted)
+    if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
+        raise BeamboxError(f"a range is one number, or x_min, y_min, x_max, y_max in metres, got {wanted}")
+    low, high = [], []
+    for axis in (0, 1):
+        step, start = model_grid.cell[axis] * STRIDE, model_grid.minimum[axis]
+        first = math.floor((numbers[axis] - start) / step + 1e-6)
+        last = math.ceil((numbers[axis + 2] - start) / step - 1e-6)
+        low.append(start + first * step)
+        high.append(start + last * step)
+    return VoxelGrid(
+        (low[0], low[1], model_grid.minimum[2]), (high[0], high[1], model_grid.maximum[2]), model_grid.cell
+    )
+
+
+def find_weights(name: str | Path) -> Path:
+    """Find a weight file: a shipped name, a path, or the folder of a training run.
+
+    Raises:
+        BeamboxError: naming the nearest shipped name.
+    """
+    path = Path(name)
+    if path.is_file():
+        if path.suffix.lower() in (".pth", ".pt", ".ckpt"):
+            raise BeamboxError(
+                f"{path} is a PyTorch checkpoint; beambox reads .safetensors. One of OpenPCDet's is converted by "
+                "`beambox import-openpcdet`; one of a training run lies beside its weights"
+            )
+        return path
+    if path.is_dir():
+        for file in ("best.safetensors", "last.safetensors", "model.safetensors"):
+            if (path / file).is_file():
+                return path / file
+        found = sorted(path.glob("*.safetensors"))
+        if len(found) == 1:
+            return found[0]
+        raise MissingFileError(f"{path} is a folder with {len(found)} weight files; name one (*.safetensors)")
+    names = shipped()
+    if str(name) in names:
+        return names[str(name)]
+    hint = did_you_mean(str(name), names) if names else "; none is shipped with this installation"
+    raise MissingFileError(f'no weights are called "{name}" and no such file is there{hint}')
+
+
+def load(
+    name: str | Path,
+    *,
+    device: str | torch.device | None = None,
+    precision: str = "auto",
+    range: float | Sequence[float] | VoxelGrid | None = None,
+    view: View = "auto",
+    sensor_height: float | None = None,
+    axes: str | Axes | None = None,
+    intensity_scale: float | None = None,
+    fields: str | Sequence[str] | None = None,
+    batch_size: int = 1,
+) -> Detector:
+    """Load a detector.
+
+    Args:
+        name: a shipped name (`beambox models` lists them), a .safetensors file, or the folder of a training run.
+        device: "cpu", "cuda", ...; None takes the GPU where there is one.
+        precision: "auto" (bfloat16 where the machine computes it natively), "float32", "bfloat16" or "float16".
+        range: look elsewhere than in training, with the same cells: a number r for -r to r on both axes (360 degrees),
+            or x_min, y_min, x_max, y_max in metres, or a :class:`VoxelGrid`.
+        view: "camera", "full" or "auto"; see :class:`Detector`.
+        sensor_height: metres of this sensor above the ground (0 where the points' origin lies on it), where that
+            differs from the training sensor's.
+        axes: where x and y lead, such as ``"x: right, y: forward"``, where that is not forward and left.
+        intensity_scale: factor that brings the intensity to [0, 1], such as 0.01 for percent; None finds it from the
+            numbers, as :mod:`beambox.data.reading` says.
+        fields: names of the columns of files that do not name them, such as "x,y,z,intensity,ring".
+        batch_size: sweeps that go through the network together when a list is given.
+
+    Raises:
+        BeamboxError: if there are no such weights, the file is broken, or an option cannot be used.
+    """
+    path = find_weights(name)
+    chosen = choose_device(device)
+    model = load_weights(path, "cpu")
+    card = read_weights(path).card
+    trained = float(card.get("sensor_height", KITTI_SENSOR_HEIGHT))
+    corrections = Corrections(
+        axes=Axes.parse(axes) if isinstance(axes, str) else axes or Axes(),
+        raise_by=0.0 if sensor_height is None else sensor_height - trained,
+    )
+    grid: VoxelGrid = model.config.grid  # pyright: ignore[reportAssignmentType, reportAttributeAccessIssue]
+    return Detector(
+        model,
+        card=card,
+        device=chosen,
+        precision=precision,
+        grid=grid if range is None else region(grid, range),
+        view=view,
+        corrections=corrections,
+        intensity_scale=intensity_scale,
+        fields=fields,
+        batch_size=batch_size,
+    )
