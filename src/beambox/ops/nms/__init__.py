@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, choose
 from beambox.ops.nms import reference
 
 __all__ = ["nms"]
 
-BACKENDS = (Backend("reference", always, lambda: reference.nms),)
+
+def _numba() -> Callable[..., Tensor]:
+    from beambox.ops.nms import cpu
+
+    return cpu.nms
+
+
+BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.nms))
 
 
 def nms(boxes: Tensor, scores: Tensor, threshold: float, pre: int = 4096, post: int = 500) -> Tensor:

@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, choose
 from beambox.ops.points_in_boxes import reference
 
 __all__ = ["points_in_boxes", "points_in_boxes_mask"]
 
-OWNER_BACKENDS = (Backend("reference", always, lambda: reference.points_in_boxes),)
-MASK_BACKENDS = (Backend("reference", always, lambda: reference.points_in_boxes_mask),)
+
+def _numba_owner() -> Callable[..., Tensor]:
+    from beambox.ops.points_in_boxes import cpu
+
+    return cpu.points_in_boxes
+
+
+def _numba_mask() -> Callable[..., Tensor]:
+    from beambox.ops.points_in_boxes import cpu
+
+    return cpu.points_in_boxes_mask
+
+
+OWNER_BACKENDS = (
+    Backend("numba", can_run_numba, _numba_owner),
+    Backend("reference", always, lambda: reference.points_in_boxes),
+)
+MASK_BACKENDS = (
+    Backend("numba", can_run_numba, _numba_mask),
+    Backend("reference", always, lambda: reference.points_in_boxes_mask),
+)
 
 
 def points_in_boxes(points: Tensor, boxes: Tensor) -> Tensor:

@@ -2,17 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, choose, needs_gradient
 from beambox.ops.rotated_iou import reference
 
 __all__ = ["intersection_bev", "iou_3d", "iou_bev"]
 
-BEV_BACKENDS = (Backend("reference", always, lambda: reference.iou_bev),)
-BOX_BACKENDS = (Backend("reference", always, lambda: reference.iou_3d),)
-AREA_BACKENDS = (Backend("reference", always, lambda: reference.intersection_bev),)
+
+def _can_run_numba(a: Tensor, b: Tensor) -> str | None:
+    if needs_gradient(a, b):
+        return "a box requires a gradient, which the reference alone gives"
+    return can_run_numba(a, b)
+
+
+def _numba_bev() -> Callable[..., Tensor]:
+    from beambox.ops.rotated_iou import cpu
+
+    return cpu.iou_bev
+
+
+def _numba_3d() -> Callable[..., Tensor]:
+    from beambox.ops.rotated_iou import cpu
+
+    return cpu.iou_3d
+
+
+def _numba_area() -> Callable[..., Tensor]:
+    from beambox.ops.rotated_iou import cpu
+
+    return cpu.intersection_bev
+
+
+BEV_BACKENDS = (Backend("numba", _can_run_numba, _numba_bev), Backend("reference", always, lambda: reference.iou_bev))
+BOX_BACKENDS = (Backend("numba", _can_run_numba, _numba_3d), Backend("reference", always, lambda: reference.iou_3d))
+AREA_BACKENDS = (
+    Backend("numba", _can_run_numba, _numba_area),
+    Backend("reference", always, lambda: reference.intersection_bev),
+)
 
 
 def iou_bev(a: Tensor, b: Tensor) -> Tensor:

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
 from beambox.geometry.grid import VoxelGrid
-from beambox.ops.dispatch import Backend, always, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, choose
 from beambox.ops.voxelize import reference
 from beambox.ops.voxelize.voxels import Voxels
 
 __all__ = ["Voxels", "voxelize"]
 
-BACKENDS = (Backend("reference", always, lambda: reference.voxelize),)
+
+def _numba() -> Callable[..., Voxels]:
+    from beambox.ops.voxelize import cpu
+
+    return cpu.voxelize
+
+
+BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.voxelize))
 
 
 def voxelize(

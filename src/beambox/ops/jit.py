@@ -1,0 +1,52 @@
+"""How CPU kernels are compiled: by numba, once, without the interpreter's lock.
+
+Kernels run on the calling thread; :func:`run_in_blocks` spreads the long ones over as many threads as PyTorch may
+use. Plain threads are used rather than numba's own, whose pools may neither be entered by two threads at a time nor be
+used before a fork, and data loaders do both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
+
+import numba
+import torch
+
+__all__ = ["jit", "run_in_blocks"]
+
+
+def jit(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a kernel on its first call; keep the machine code on disk where a folder can be written.
+
+    No ``fastmath``: kernels round as the reference does.
+    """
+    options = {"nogil": True, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # numba found no folder for its cache
+        return numba.njit(**options)(function)
+
+
+def run_in_blocks(kernel: Callable[[int, int], None], length: int, smallest: int = 1) -> None:
+    """Run ``kernel(start, stop)`` over ``0 .. length`` in one block a thread.
+
+    Blocks must be independent, so that the result does not depend on their number.
+
+    Args:
+        kernel: releases the interpreter's lock, or nothing is won.
+        length: number of items.
+        smallest: no block is shorter, as starting a thread takes about 0.1 ms.
+    """
+    blocks = max(1, min(torch.get_num_threads(), length // max(1, smallest)))
+    edges = [length * i // blocks for i in range(blocks + 1)]
+    if blocks == 1:
+        kernel(0, length)
+        return
+    with ThreadPoolExecutor(blocks - 1) as pool:
+        waiting = [pool.submit(kernel, start, stop) for start, stop in list(pairwise(edges))[1:]]
+        kernel(edges[0], edges[1])
+        for block in waiting:
+            block.result()

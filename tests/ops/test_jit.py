@@ -1,0 +1,76 @@
+"""Compiling kernels, with and without a folder for the cache, and running them in blocks."""
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from beambox.ops.jit import jit, run_in_blocks
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("length", [0, 1, 2, 7, 100])
+def test_run_in_blocks_covers_every_item_once(threads, count, length):
+    threads(count)
+    seen = np.zeros(length, int)
+    workers = set()
+
+    def kernel(start, stop):
+        workers.add(threading.get_ident())
+        seen[start:stop] += 1
+
+    run_in_blocks(kernel, length)
+    assert (seen == 1).all()
+    assert len(workers) <= count
+
+
+def test_run_in_blocks_hands_on_an_error_of_any_block(threads):
+    threads(2)
+
+    def kernel(start, stop):
+        if start > 0:
+            raise ZeroDivisionError("in the second block")
+
+    with pytest.raises(ZeroDivisionError, match="second block"):
+        run_in_blocks(kernel, 10)
+
+
+def test_run_in_blocks_keeps_short_work_on_one_thread(threads):
+    threads(2)
+    blocks = []
+    run_in_blocks(lambda start, stop: blocks.append((start, stop)), 10, smallest=8)
+    assert blocks == [(0, 10)]
+
+
+def test_jit_works_where_no_cache_folder_can_be_written(tmp_path):
+    (tmp_path / "kernel.py").write_text(
+        "from beambox.ops.jit import jit\n@jit\ndef twice(x):\n    return 2 * x\nprint(twice(21))\n"
+    )
+    script = (
+        "import numba.core.caching as caching\n"
+        "caching.CacheImpl._locator_classes = []\n"  # as on a read-only file system: no locator fits
+        "import runpy; runpy.run_path('kernel.py')"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "42"
+
+
+def test_jit_compiles(tmp_path):
+    assert jit(lambda x: x + 1)(np.float32(1)) == 2
