@@ -82,3 +82,29 @@ def kitti(
     print(result.table(), end="")
     if json is not None:
         write_json(json, result.to_json())
+
+
+@app.command()
+@guard
+def once(
+    annotations: Annotated[Path, typer.Option(help="JSON with ground_truth, and with predictions unless --results")],
+    results: Annotated[Path | None, typer.Option(help="JSON list of predictions in a file of its own")] = None,
+    five_classes: Annotated[bool, typer.Option("--five-classes", help="do not merge Car, Bus, Truck")] = False,
+    iou: Iou = "",
+    true_rotation: Annotated[bool, typer.Option("--true-rotation", help="turn boxes the right way round")] = False,
+    published: Annotated[bool, typer.Option("--published", help="also print the rows of DenNet's Table 3")] = False,
+    json: Json = None,
+) -> None:
+    """Score ONCE predictions as the official devkit does."""
+    from beambox.metrics.once import evaluate_annotations
+
+    result = evaluate_annotations(
+        annotations,
+        results,
+        five_classes=five_classes,
+        min_overlap=parse_overlaps(iou),
+        true_rotation=true_rotation,
+    )
+    print(result.table(published=published), end="")
+    if json is not None:
+        write_json(json, result.to_json())

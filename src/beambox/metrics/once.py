@@ -1,0 +1,297 @@
+"""ONCE's benchmark: AP with a heading gate, for each class and band of distance.
+
+The algorithm is that of the official devkit (ONCE_Benchmark, CPU evaluation), its quirks included:
+
+* a box of another class that lies outside the band is ignored, not left out, and may absorb a detection;
+* a pair whose headings differ by more than 90 degrees does not overlap;
+* boxes are turned clockwise by their headings, although headings grow counter-clockwise. Published numbers carry this;
+  ``true_rotation`` turns them the right way round (on our recording that moves single APs by up to 4 points);
+* a pair whose centres lie more than 5 m apart does not overlap;
+* thresholds repeat where there are few objects, so small sets are not penalised (KITTI's are);
+* a class without objects in a band scores 0 and counts in the mean.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.geometry.boxes import wrap_angle
+from beambox.metrics.matching import MatchTable, count, sampled_precision, true_positive_scores
+from beambox.metrics.once_result import OnceResult
+from beambox.metrics.overlap import rotated_overlaps, starts
+from beambox.structures.detections import Detections
+from beambox.structures.labels import Labels
+
+__all__ = [
+    "FIVE_CLASSES",
+    "SUPERCLASSES",
+    "OnceBoxes",
+    "OnceResult",
+    "evaluate",
+    "evaluate_annotations",
+    "evaluate_boxes",
+    "score_thresholds",
+]
+
+Floats = NDArray[np.float64]
+
+SUPERCLASSES = {"Vehicle": 0.7, "Pedestrian": 0.3, "Cyclist": 0.5}
+"""Classes of the default mode, with the IoU above which a detection matches."""
+FIVE_CLASSES = {"Car": 0.7, "Bus": 0.7, "Truck": 0.7, "Pedestrian": 0.3, "Cyclist": 0.5}
+"""Classes as the labels have them."""
+SUPERCLASS_OF = {"Car": "Vehicle", "Bus": "Vehicle", "Truck": "Vehicle"}
+LIMITS = ((0.0, math.inf), (0.0, 30.0), (30.0, 50.0), (50.0, math.inf))
+"""Distance of each band, metres; the upper end does not belong to it."""
+SAMPLES = 51
+FARTHEST_PAIR = 5.0
+"""Centres, seen from above, farther apart than this many metres do not overlap."""
+
+
+@dataclass(frozen=True)
+class OnceBoxes:
+    """Boxes of one frame, ground truth or predictions; N boxes."""
+
+    names: tuple[str, ...]
+    """Class of each."""
+    boxes: Floats
+    """``(N, 7)`` x, y, z, l, w, h, yaw in the sensor's frame; metres, radians."""
+    scores: Floats
+    """``(N,)``; zeros for ground truth."""
+
+
+def evaluate(
+    frames: Iterable[tuple[Labels, Detections]],
+    *,
+    five_classes: bool = False,
+    min_overlap: Mapping[str, float] | None = None,
+    true_rotation: bool = False,
+) -> OnceResult:
+    """Score detections in memory.
+
+    Args:
+        frames: ground truth and detections of every annotated frame.
+        five_classes: score the labels' own classes instead of merging Car, Bus and Truck into Vehicle.
+        min_overlap: other IoU thresholds, by class.
+        true_rotation: turn boxes counter-clockwise; the numbers then no longer compare with published ones.
+
+    Raises:
+        BeamboxError: if there is no frame or a threshold is given for a class that is not scored.
+    """
+    pairs = []
+    for labels, found in frames:
+        truth_boxes, boxes = labels.boxes.double(), found.boxes.detach().cpu().double()
+        for each in (truth_boxes, boxes):
+            each[:, 6] = wrap_angle(each[:, 6])
+        truth = OnceBoxes(labels.names, truth_boxes.numpy(), np.zeros(len(labels)))
+        scores = found.scores.detach().cpu().double().numpy()
+        pairs.append((truth, OnceBoxes(tuple(found.names), boxes.numpy(), scores)))
+    return evaluate_boxes(pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation)
+
+
+def evaluate_annotations(
+    annotations: Path,
+    results: Path | None = None,
+    *,
+    five_classes: bool = False,
+    min_overlap: Mapping[str, float] | None = None,
+    true_rotation: bool = False,
+) -> OnceResult:
+    """Score a file of annotations and predictions.
+
+    Args:
+        annotations: JSON ``{"ground_truth": [...], "predictions": [...]}``, each entry
+            ``{"frame_id", "names", "boxes_3d"}`` and ``"scores"`` with the predictions.
+        results: JSON list of predictions, where they lie in a file of their own.
+        five_classes: as for :func:`evaluate`.
+        min_overlap: as for :func:`evaluate`.
+        true_rotation: as for :func:`evaluate`.
+
+    Raises:
+        BeamboxError: naming the file and the key that cannot be used.
+    """
+    content = _read(annotations)
+    truths = _entries(content, "ground_truth", annotations)
+    founds = (
+        _entries(content, "predictions", annotations)
+        if results is None
+        else _entries(_read(results), "predictions", results)
+    )
+    found_by_id = {_frame_id(entry): entry for entry in founds}
+    known = {_frame_id(entry) for entry in truths}
+    missing = [name for name in known if name not in found_by_id]
+    source = annotations if results is None else results
+    if missing:
+        raise BeamboxError(
+            f"{source}: {len(missing)} of {len(known)} annotated frames have no predictions, the first is "
+            f"{min(missing)}; write an entry with empty lists where nothing was found"
+        )
+    pairs = []
+    for entry in truths:
+        name = _frame_id(entry)
+        truth = _boxes(entry, f"{annotations}, ground truth of frame {name}", scored=False)
+        pairs.append((truth, _boxes(found_by_id[name], f"{source}, predictions of frame {name}", scored=True)))
+    return evaluate_boxes(pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation)
+
+
+def evaluate_boxes(
+    pairs: Sequence[tuple[OnceBoxes, OnceBoxes]],
+    *,
+    five_classes: bool = False,
+    min_overlap: Mapping[str, float] | None = None,
+    true_rotation: bool = False,
+) -> OnceResult:
+    """Score boxes; arguments as in :func:`evaluate`, with (ground truth, predictions) of each frame."""
+    if not pairs:
+        raise BeamboxError("there is nothing to score: no frame was given")
+    minima = _thresholds(FIVE_CLASSES if five_classes else SUPERCLASSES, min_overlap or {})
+    merge = {} if five_classes else SUPERCLASS_OF
+    truth_name = np.array([merge.get(name, name) for truth, _ in pairs for name in truth.names], dtype=np.str_)
+    found_name = np.array([merge.get(name, name) for _, found in pairs for name in found.names], dtype=np.str_)
+    truth_range, found_range = (
+        np.concatenate([np.linalg.norm(pair[side].boxes[:, :3], axis=1) for pair in pairs]) for side in (0, 1)
+    )
+    overlap = np.concatenate(
+        [gated_overlap(truth.boxes, found.boxes, true_rotation).reshape(-1) for truth, found in pairs]
+    )
+    sizes = [(len(truth.names), len(found.names)) for truth, found in pairs]
+    scores = np.concatenate([found.scores for _, found in pairs])
+    nothing = np.zeros(len(scores), dtype=np.bool_)
+    values, objects = [], []
+    for name, minimum in minima.items():
+        tables = [
+            MatchTable(
+                truth_start=starts([t for t, _ in sizes]),
+                found_start=starts([d for _, d in sizes]),
+                pair_start=starts([t * d for t, d in sizes]),
+                overlap=overlap,
+                min_overlap=minimum,
+                truth_flag=_flags(truth_name == name, truth_range, band),
+                found_flag=_flags(found_name == name, found_range, band),
+                score=scores,
+                spares=nothing,
+                truth_alpha=np.zeros(len(truth_name)),
+                found_alpha=np.zeros(len(found_name)),
+            )
+            for band in LIMITS
+        ]
+        values.append(tuple(_average_precision(table) for table in tables))
+        objects.append(tuple(table.objects for table in tables))
+    return OnceResult(tuple(minima), tuple(minima.values()), tuple(values), tuple(objects), len(pairs))
+
+
+def gated_overlap(truth: Floats, found: Floats, true_rotation: bool = False) -> Floats:
+    """Return the 3-D IoU as the devkit has it, 0 for far pairs and opposed headings.
+
+    Args:
+        truth: ``(N, 7)``.
+        found: ``(M, 7)``.
+        true_rotation: turn boxes counter-clockwise instead of clockwise.
+
+    Returns:
+        ``(N, M)``.
+    """
+    sense = np.array([1, 1, 1, 1, 1, 1, 1 if true_rotation else -1])
+    overlap = rotated_overlaps(truth * sense, found * sense)[1]
+    turn = np.abs(truth[:, None, 6] - found[None, :, 6])
+    turn = np.where(turn >= math.pi, 2 * math.pi - turn, turn)
+    apart = np.hypot(truth[:, None, 0] - found[None, :, 0], truth[:, None, 1] - found[None, :, 1])
+    return np.where((turn > math.pi / 2) | (apart > FARTHEST_PAIR), 0.0, overlap)
+
+
+def score_thresholds(scores: Floats, objects: int) -> Floats:
+    """Choose at most 51 score thresholds, 1/50 of recall apart; a score repeats where one object spans several.
+
+    Args:
+        scores: of the true positives of the first pass, descending.
+        objects: number of ground-truth boxes that count.
+    """
+    chosen, recall = [], 0.0
+    last = len(scores) - 1
+    for i, score in enumerate(scores):
+        left = (i + 1) / objects
+        right = (i + 2) / objects if i < last else left
+        if right + left < 2 * recall and i < last:
+            continue
+        chosen.append(score)
+        recall += 1 / (SAMPLES - 1)
+        while right + left + 1e-6 > 2 * recall:
+            chosen.append(score)
+            recall += 1 / (SAMPLES - 1)
+    return np.array(chosen[:SAMPLES])
+
+
+def _flags(of_class: NDArray[np.bool_], distance: Floats, band: tuple[float, float]) -> NDArray[np.int64]:
+    flags = np.where(of_class, 0, -1)
+    flags[(distance < band[0]) | (distance >= band[1])] = 1  # whatever the class, as the devkit does
+    return flags
+
+
+def _average_precision(table: MatchTable) -> float:
+    if table.objects == 0:
+        return 0.0
+    counts = count(table)
+    thresholds = score_thresholds(true_positive_scores(table), table.objects)
+    return float(100 * sampled_precision(counts, counts.precision(), thresholds, SAMPLES)[1:].sum() / (SAMPLES - 1))
+
+
+def _thresholds(classes: Mapping[str, float], given: Mapping[str, float]) -> dict[str, float]:
+    for name, value in given.items():
+        if name not in classes:
+            raise BeamboxError(
+                f"an IoU threshold was given for {name!r}, which is not scored{did_you_mean(name, classes)}"
+            )
+        if not 0 < value < 1:
+            raise BeamboxError(f"the IoU threshold of {name!r} must lie between 0 and 1, got {value:g}")
+    return {**classes, **given}
+
+
+def _read(path: Path) -> Any:
+    if not path.is_file():
+        raise MissingFileError(f"{path} does not exist; it holds ONCE annotations as JSON")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise BeamboxError(f"{path} is not valid JSON: {error}") from error
+
+
+def _entries(content: Any, key: str, path: Path) -> list[dict[str, Any]]:
+    """Return the list of frames, which may stand alone or under a key, without those that nobody annotated."""
+    if isinstance(content, dict):
+        if key not in content:
+            raise BeamboxError(f"{path}: the key {key!r} is missing{did_you_mean(key, content)}")
+        content = content[key]
+    if not isinstance(content, list) or not all(isinstance(entry, dict) and "frame_id" in entry for entry in content):
+        raise BeamboxError(f"{path}: {key} must be a list of frames, each with a frame_id")
+    return content
+
+
+def _frame_id(entry: Mapping[str, Any]) -> str:
+    return str(entry["frame_id"])
+
+
+def _boxes(entry: Mapping[str, Any], where: str, scored: bool) -> OnceBoxes:
+    entry = entry.get("annos", entry)
+    for key in ("names", "boxes_3d", *(("scores",) if scored else ())):
+        if key not in entry and not (key == "scores" and "score" in entry) and not (key == "names" and "name" in entry):
+            raise BeamboxError(f"{where}: the key {key!r} is missing{did_you_mean(key, entry)}")
+    names = tuple(map(str, entry.get("names", entry.get("name"))))
+    try:
+        boxes = np.array(entry["boxes_3d"], dtype=np.float64).reshape(-1, 7)
+        scores = np.array(entry.get("scores", entry.get("score")) if scored else [0.0] * len(names), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BeamboxError(f"{where}: boxes_3d must be rows of x y z l w h yaw and scores numbers, {error}") from error
+    if not len(names) == len(boxes) == len(scores):
+        told = f"{len(names)} names, {len(boxes)} boxes_3d" + (f", {len(scores)} scores" if scored else "")
+        raise BeamboxError(f"{where}: lists must have one length, got {told}")
+    if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
+        raise BeamboxError(f"{where}: boxes_3d and scores must be finite numbers")
+    return OnceBoxes(names, boxes, scores)
