@@ -1,1 +1,7 @@
-"""beambox.simulate."""
+"""A LiDAR simulator: scenes of shapes, ray casting with numba, KITTI-layout data sets with labels."""
+
+from beambox.simulate.frames import SimulatedSource, simulate_frame
+from beambox.simulate.sensors import SENSORS, Sensor, load_sensor
+from beambox.simulate.writer import write_dataset
+
+__all__ = ["SENSORS", "Sensor", "SimulatedSource", "load_sensor", "simulate_frame", "write_dataset"]

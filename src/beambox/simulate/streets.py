@@ -1,0 +1,221 @@
+"""Random streets: roads, traffic, parked cars, people; and the scenery along a road."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from beambox.simulate import scenery
+from beambox.simulate.ground import Ground, Road
+from beambox.simulate.stage import Stage, draw_size
+
+__all__ = ["dress", "random_ground", "random_street"]
+
+_REACH = 78.0  # metres; nothing is put farther away
+
+
+def random_ground(roads: tuple[Road, ...], rng: np.random.Generator, height: float) -> Ground:
+    """A ground as KITTI's scans show it: it rises by about 0.85 % ahead (the sensor's pitch) and bends.
+
+    Args:
+        roads: the roads.
+        rng: source of the choices.
+        height: of the sensor, metres.
+    """
+    count = 4
+    amplitude, length = rng.uniform(0.002, 0.03, count), rng.uniform(6.0, 40.0, count)
+    angle, phase = rng.uniform(0, math.tau, count), rng.uniform(0, math.tau, count)
+    wave = math.tau / length
+    waves = np.stack((amplitude, wave * np.cos(angle), wave * np.sin(angle), phase), axis=1)
+    return Ground(
+        height=-height + rng.normal(-0.04, 0.03),
+        slope=(rng.normal(0.0080, 0.005), rng.normal(0.0, 0.010)),
+        bend=(rng.normal(0.0, 0.00025), rng.normal(0.0, 0.00025)),
+        waves=waves,
+        roads=roads,
+        crown=rng.uniform(0.0, 0.06),
+        bank=rng.choice([0.0, 0.0, rng.uniform(-0.1, 0.25)]),
+        bank_limit=rng.uniform(0.2, 2.0),
+        roughness=(rng.uniform(0.001, 0.006), rng.uniform(0.002, 0.008), rng.uniform(0.01, 0.08)),
+    )
+
+
+class _Line:
+    """Places along a road: u metres along it, s metres to the left of its centre line."""
+
+    def __init__(self, road: Road) -> None:
+        self.road = road
+
+    def at(self, u: float, s: float) -> tuple[float, float, float]:
+        """x, y and the road's direction there."""
+        road = self.road
+        across = road.offset + s + 0.5 * road.bend * u * u
+        c, sn = math.cos(road.angle), math.sin(road.angle)
+        return c * u - sn * across, sn * u + c * across, road.angle + math.atan(road.bend * u)
+
+
+def _parked(stage: Stage, line: _Line, side: float, fill: float, across: bool) -> None:
+    """A row of parked cars along a kerb; ``across`` parks them at right angles to it."""
+    rng, road = stage.rng, line.road
+    u = stage.ahead + rng.uniform(-4, 6)
+    inset = rng.uniform(0.1, 0.5) if rng.random() < 0.75 else -rng.uniform(0.2, 1.2)
+    while u < _REACH:
+        name = rng.choice(["Car", "Car", "Car", "Car", "Car", "Car", "Car", "Car", "Car", "Van", "Misc"])
+        size = draw_size(str(name), rng)
+        along = size[1] if across else size[0]
+        u += along / 2
+        if rng.random() < fill:
+            depth = size[0] / 2 + 0.2 if across else -(size[1] / 2 + inset)
+            x, y, direction = line.at(u, side * (road.half_width + depth))
+            turn = math.pi / 2 * side if across else (0.0 if side < 0 else math.pi)
+            turn += math.pi if rng.random() < (0.4 if across else 0.1) else 0.0
+            stage.add_object(str(name), x, y, direction + turn + rng.normal(0, 0.03), size)
+        u += along / 2 + rng.exponential(0.7 if not across else 0.3) + 0.4
+
+
+def _traffic(stage: Stage, line: _Line, density: float) -> None:
+    rng, road = stage.rng, line.road
+    lanes = max(1, int(road.half_width / 3.0))
+    for side in (1.0, -1.0):
+        for lane in range(lanes):
+            u = stage.ahead + rng.uniform(0, 25)
+            while u < _REACH:
+                if rng.random() < density:
+                    name = str(rng.choice(["Car", "Van", "Truck", "Cyclist", "Tram"], p=[0.82, 0.07, 0.04, 0.06, 0.01]))
+                    s = side * (lane + 0.5) * min(3.3, road.half_width / lanes)
+                    x, y, direction = line.at(u, s + rng.normal(0, 0.3))
+                    turn = 0.0 if side < 0 else math.pi
+                    stage.add_object(name, x, y, direction + turn + rng.normal(0, 0.05))
+                u += rng.uniform(7, 30)
+
+
+def _people(stage: Stage, line: _Line, count: int) -> None:
+    rng, road = stage.rng, line.road
+    for _ in range(count):
+        side = 1.0 if rng.random() < 0.5 else -1.0
+        u = rng.uniform(4, 50) if stage.ahead == 0 or rng.random() < 0.6 else rng.uniform(stage.ahead / 2, 4)
+        kind = rng.random()
+        if kind < 0.68:
+            s = side * (road.half_width + rng.uniform(-1.0, max(road.pavement, 1.0)))
+            x, y, direction = line.at(u, s)
+            turn = direction + (0.0 if rng.random() < 0.5 else math.pi) + rng.normal(0, 0.5)
+            for k in range(rng.integers(1, 4)):
+                stage.add_object("Pedestrian", x + 0.1 * k, y + 0.75 * k, turn + rng.normal(0, 0.2))
+        elif kind < 0.95:
+            x, y, direction = line.at(u, side * (road.half_width + rng.uniform(-2.0, 1.5)))
+            stage.add_object("Cyclist", x, y, direction + (0.0 if side < 0 else math.pi) + rng.normal(0, 0.15))
+        else:
+            x, y, direction = line.at(u, side * (road.half_width + rng.uniform(1.0, 3.0)))
+            stage.add_object("Person_sitting", x, y, direction + rng.uniform(-math.pi, math.pi))
+
+
+def random_street(stage: Stage, roads: tuple[Road, ...]) -> None:
+    """Fill a stage with traffic, parked cars, people and scenery along its roads."""
+    rng = stage.rng
+    for number, road in enumerate(roads):
+        line = _Line(road)
+        lively = rng.uniform(0.0, 0.55) if number == 0 else rng.uniform(0.0, 0.3)
+        _traffic(stage, line, lively)
+        for side in (1.0, -1.0):
+            kind = rng.random()
+            if kind < 0.62:
+                _parked(stage, line, side, rng.uniform(0.15, 1.0), across=rng.random() < 0.22)
+        if rng.random() < 0.65:
+            _people(stage, line, int(rng.integers(1, 8)))
+    for _ in range(rng.integers(0, 6)):  # drives, yards, crossings: any heading
+        x, y = rng.uniform(8, 60), rng.uniform(-25, 25)
+        x = -x if stage.ahead < 0 and rng.random() < 0.5 else x
+        name = str(rng.choice(["Car", "Car", "Car", "Van", "Truck", "Misc"]))
+        stage.add_object(name, x, y, rng.uniform(-math.pi, math.pi))
+    for road in roads:
+        dress(stage, road)
+
+
+def dress(stage: Stage, road: Road) -> None:
+    """Put scenery on both sides of a road: verge, fronts, and what stands behind."""
+    rng = stage.rng
+    line = _Line(road)
+    for side in (1.0, -1.0):
+        edge = road.half_width + road.pavement
+        _verge(stage, line, side, edge)
+        built = rng.random()
+        if built < 0.85:
+            _fronts(stage, line, side, edge + rng.uniform(0.2, 9.0), rng.uniform(0.3, 1.0))
+        _clutter(stage, line, side, edge, int(rng.integers(2, 14)))
+    for _ in range(rng.integers(4, 25)):
+        x, y = rng.uniform(stage.ahead or 5.0, _REACH), rng.uniform(-45, 45)
+        if abs(y) > 6:
+            stage.add_scenery(scenery.tree(rng.uniform(3, 12), stage.palette, rng), x, y, rng.uniform(0, math.tau))
+
+
+def _verge(stage: Stage, line: _Line, side: float, edge: float) -> None:
+    """Poles, trees, and perhaps a rail, at the kerb."""
+    rng, road = stage.rng, line.road
+    yaw_side = math.pi if side < 0 else 0.0
+    u, step = stage.ahead + rng.uniform(2, 20), rng.uniform(7, 40)
+    trees = rng.random() < 0.4
+    while u < _REACH:
+        x, y, direction = line.at(u, side * (road.half_width + rng.uniform(0.25, 0.9)))
+        if trees and rng.random() < 0.7:
+            shape = scenery.tree(rng.uniform(4, 11), stage.palette, rng)
+        else:
+            shape = scenery.pole(rng.uniform(1.0, 8.0), stage.palette, rng)
+        stage.add_scenery(shape, x, y, direction + yaw_side, gap=0.1)
+        u += step * rng.uniform(0.5, 1.5)
+    if rng.random() < 0.1:
+        for k in range(int((_REACH - stage.ahead) // 6)):
+            x, y, direction = line.at(stage.ahead + 6.0 * k, side * (edge + 0.2))
+            stage.add_scenery(scenery.rail(6.0, stage.palette, rng), x, y, direction, gap=0.0)
+
+
+def _fronts(stage: Stage, line: _Line, side: float, setback: float, fill: float) -> None:
+    """Houses, walls, hedges and fences in a row."""
+    rng = stage.rng
+    weights = rng.dirichlet((1.2, 0.6, 0.6, 0.4))
+    u = stage.ahead + rng.uniform(-5, 5)
+    while u < _REACH + 10:
+        length = rng.uniform(4, 16)
+        kind = rng.choice(4, p=weights)
+        pieces = 1 if kind == 0 and not stage.guard else max(1, int(length // 3.0))
+        height = rng.uniform(2.6, 11.0) if kind == 0 else rng.uniform(0.5, 2.4)
+        depth = rng.uniform(4, 10)
+        for k in range(pieces):
+            part = length / pieces
+            place = u + (k + 0.5) * part
+            x, y, direction = line.at(place, side * setback)
+            yaw = direction if side > 0 else direction + math.pi
+            if rng.random() > fill:
+                continue
+            if kind == 0:
+                shape = scenery.house(part, depth, height, stage.palette, rng)
+            elif kind == 1:
+                shape = scenery.wall(part, height, stage.palette, rng)
+            elif kind == 2:
+                shape = scenery.hedge(part, height, stage.palette, rng)
+            else:
+                shape = scenery.fence(part, height, stage.palette, rng)
+            stage.add_scenery(shape, x, y, yaw, gap=0.0)
+        u += length + (rng.uniform(0, 8) if rng.random() < 0.4 else 0.0)
+        setback += rng.normal(0, 0.4)
+
+
+def _clutter(stage: Stage, line: _Line, side: float, edge: float, count: int) -> None:
+    """Bushes, bins, heaps and low hedges: things of a car's size that are none."""
+    rng = stage.rng
+    for _ in range(count):
+        u = rng.uniform(stage.ahead + 4, 60)
+        x, y, direction = line.at(u, side * (edge + rng.uniform(-1.2, 12.0)))
+        kind, turn = rng.random(), rng.uniform(0, math.tau)
+        if kind < 0.35:
+            shape = scenery.bush(rng.uniform(0.6, 2.2), rng.uniform(0.4, 2.4), stage.palette, rng)
+        elif kind < 0.55:
+            size = (rng.uniform(0.3, 3.5), rng.uniform(0.3, 1.8), rng.uniform(0.5, 2.0))
+            shape, turn = scenery.bin_box(size, stage.palette, rng), direction + rng.normal(0, 0.2)
+        elif kind < 0.7:
+            shape, turn = scenery.hedge(rng.uniform(1, 5), rng.uniform(0.4, 1.8), stage.palette, rng), direction
+        elif kind < 0.8:
+            shape = scenery.rubble(rng.uniform(0.5, 2.0), stage.palette, rng)
+        else:
+            shape = scenery.pole(rng.uniform(0.6, 6.0), stage.palette, rng)
+        stage.add_scenery(shape, x, y, turn)
