@@ -11,6 +11,7 @@ from torch import nn
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
+from beambox.detectors.second import SecondConfig, second
 
 __all__ = ["CATALOGUE", "CatalogueEntry", "build", "config_from_dict", "config_to_dict"]
 
@@ -25,6 +26,7 @@ class CatalogueEntry:
 
 CATALOGUE: dict[str, CatalogueEntry] = {
     "pointpillars": CatalogueEntry(PointPillarsConfig, pointpillars),
+    "second": CatalogueEntry(SecondConfig, second),
 }
 
 

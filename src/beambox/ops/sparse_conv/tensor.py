@@ -82,4 +82,8 @@ class SparseTensor:
 
     def to_bev(self) -> Tensor:
         """Stack the height levels into channels: ``(B, C * Z, Y, X)``, channel ``c * Z + z`` (VoxelNet, 2.1.3)."""
-        return self.to_dense().flatten(1, 2)
+        z, y, x = self.shape
+        b, level, row, column = self.indices.unbind(dim=1)
+        bev = self.features.new_zeros((self.batch_size, y, x, self.channels, z))
+        bev = bev.transpose(3, 4).index_put((b, row, column, level), self.features)  # (B, Y, X, Z, C)
+        return bev.transpose(3, 4).flatten(3).permute(0, 3, 1, 2)  # (B, C * Z, Y, X), channels last in memory

@@ -1,0 +1,158 @@
+"""Sparse 3-D convolutions as layers (Graham et al., 2018; SECOND, section 3.1)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from beambox.ops.sparse_conv import (
+    Geometry,
+    Sites,
+    SparseTensor,
+    Triple,
+    inverse_conv3d,
+    sparse_conv3d,
+    submanifold_conv3d,
+)
+
+__all__ = ["InverseConv3d", "SparseBlock", "SparseConv3d", "SubmanifoldConv3d", "sparse_block", "submanifold_block"]
+
+BN_EPS = 1e-3
+BN_MOMENTUM = 0.01
+
+
+def triple(value: int | Triple) -> Triple:
+    """Return a size for each axis (z, y, x)."""
+    return (value, value, value) if isinstance(value, int) else value
+
+
+class _Convolution(nn.Module):
+    """Kernel and bias shared by the three kinds of convolution; the kernel is ``(kz, ky, kx, C_in, C_out)``."""
+
+    def __init__(self, in_channels: int, channels: int, kernel: Triple, bias: bool) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(*kernel, in_channels, channels))
+        self.bias = nn.Parameter(torch.empty(channels)) if bias else None
+        bound = 1 / math.sqrt(math.prod(kernel) * in_channels)  # as torch's dense convolutions start
+        nn.init.uniform_(self.weight, -bound, bound)
+        if self.bias is not None:
+            nn.init.uniform_(self.bias, -bound, bound)
+
+
+class SubmanifoldConv3d(_Convolution):
+    """Convolution that keeps the active sites."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        channels: int,
+        kernel: int | Triple = 3,
+        dilation: int | Triple = 1,
+        bias: bool = True,
+    ) -> None:
+        super().__init__(in_channels, channels, triple(kernel), bias)
+        self.geometry = Geometry.centred(triple(kernel), triple(dilation))
+
+    def forward(self, x: SparseTensor, scale: Tensor | None = None, shift: Tensor | None = None) -> SparseTensor:
+        """Convolve; ``scale`` and ``shift``, one value an output channel, replace the bias by an affine map."""
+        weight, bias = _scaled(self.weight, self.bias, scale, shift)
+        return submanifold_conv3d(x, weight, bias, self.geometry.dilation)
+
+
+class SparseConv3d(_Convolution):
+    """Strided convolution that activates every output within reach of an active input."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        channels: int,
+        kernel: int | Triple = 3,
+        stride: int | Triple = 1,
+        padding: int | Triple = 0,
+        dilation: int | Triple = 1,
+        bias: bool = True,
+    ) -> None:
+        super().__init__(in_channels, channels, triple(kernel), bias)
+        self.geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
+
+    def forward(self, x: SparseTensor, scale: Tensor | None = None, shift: Tensor | None = None) -> SparseTensor:
+        """Convolve; ``scale`` and ``shift``, one value an output channel, replace the bias by an affine map."""
+        weight, bias = _scaled(self.weight, self.bias, scale, shift)
+        geometry = self.geometry
+        return sparse_conv3d(x, weight, bias, geometry.stride, geometry.padding, geometry.dilation)
+
+
+class InverseConv3d(_Convolution):
+    """Transposed convolution onto the sites that a :class:`SparseConv3d` of the same geometry started from."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        channels: int,
+        kernel: int | Triple = 3,
+        stride: int | Triple = 1,
+        padding: int | Triple = 0,
+        dilation: int | Triple = 1,
+        bias: bool = True,
+    ) -> None:
+        super().__init__(in_channels, channels, triple(kernel), bias)
+        self.geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
+
+    def forward(self, x: SparseTensor, onto: Sites) -> SparseTensor:
+        """Carry features back onto ``onto``."""
+        geometry = self.geometry
+        return inverse_conv3d(x, self.weight, onto, self.bias, geometry.stride, geometry.padding, geometry.dilation)
+
+
+def _scaled(
+    weight: Tensor, bias: Tensor | None, scale: Tensor | None, shift: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    if scale is None or shift is None:
+        return weight, bias
+    return weight * scale, shift if bias is None else shift + bias * scale
+
+
+class SparseBlock(nn.Module):
+    """Convolution, batch norm over the active sites, ReLU; in evaluation mode folded into one convolution."""
+
+    def __init__(self, conv: SubmanifoldConv3d | SparseConv3d) -> None:
+        super().__init__()
+        self.conv = conv
+        self.norm = nn.BatchNorm1d(conv.weight.shape[-1], eps=BN_EPS, momentum=BN_MOMENTUM)
+
+    def forward(self, x: SparseTensor) -> SparseTensor:
+        """Map ``(V_in, C_in)`` features at sites to ``(V_out, C_out)``."""
+        if not self.training:
+            mean, variance = self.norm.running_mean, self.norm.running_var
+            assert mean is not None and variance is not None
+            scale = self.norm.weight / torch.sqrt(variance + self.norm.eps)
+            out = self.conv(x, scale, self.norm.bias - mean * scale)
+            return out.with_features(functional.relu(out.features))
+        out = self.conv(x)
+        if len(out.features) < 2:  # batch statistics need two values
+            features = functional.batch_norm(
+                out.features,
+                self.norm.running_mean,
+                self.norm.running_var,
+                self.norm.weight,
+                self.norm.bias,
+                eps=self.norm.eps,
+            )
+        else:
+            features = self.norm(out.features)
+        return out.with_features(functional.relu(features))
+
+
+def submanifold_block(in_channels: int, channels: int, kernel: int | Triple = 3) -> SparseBlock:
+    """Submanifold convolution without bias, batch norm (eps 1e-3, momentum 0.01), ReLU."""
+    return SparseBlock(SubmanifoldConv3d(in_channels, channels, kernel, bias=False))
+
+
+def sparse_block(
+    in_channels: int, channels: int, kernel: int | Triple, stride: int | Triple, padding: int | Triple
+) -> SparseBlock:
+    """Strided sparse convolution without bias, batch norm (eps 1e-3, momentum 0.01), ReLU."""
+    return SparseBlock(SparseConv3d(in_channels, channels, kernel, stride, padding, bias=False))

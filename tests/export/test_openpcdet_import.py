@@ -1,0 +1,111 @@
+"""Converting checkpoints: what fits is copied whole, what does not is refused with names and shapes."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from beambox.checks import BeamboxError, MissingFileError
+from beambox.cli.import_openpcdet import command
+from beambox.detectors.pointpillars import PointPillarsConfig
+from beambox.detectors.weights import load_weights
+from beambox.export.openpcdet import MODELS, import_checkpoint
+
+
+def checkpoint_of(model: str, classes: int) -> tuple[nn.Module, dict[str, Tensor]]:
+    """Draw a detector and name its tensors as OpenPCDet does."""
+    torch.manual_seed(0)
+    kind = MODELS[model]
+    config = kind.config(classes)
+    detector = kind.build(config)
+    layers = dict(kind.names(config))
+    state = {}
+    for name, value in detector.state_dict().items():
+        layer, _, leaf = name.rpartition(".")
+        state[f"{layers[layer]}.{leaf}"] = value.permute(4, 0, 1, 2, 3) if value.dim() == 5 else value
+    return detector, state
+
+
+def write(path, state):
+    torch.save({"epoch": 80, "it": 1, "model_state": state, "version": "x"}, path)
+    return path
+
+
+@pytest.mark.parametrize("classes", [1, 3, 5])
+@pytest.mark.parametrize("model", sorted(MODELS))
+def test_every_tensor_arrives(tmp_path, model, classes):
+    detector, state = checkpoint_of(model, classes)
+    state["global_step"] = torch.tensor([7])
+    read = import_checkpoint(write(tmp_path / "c.pth", state), model)
+    assert len(read.config.classes) == classes
+    for name, value in detector.state_dict().items():
+        assert read.state_dict()[name].equal(value), name
+
+
+def test_what_does_not_fit_is_refused_with_names_and_shapes(tmp_path):
+    _, state = checkpoint_of("pointpillars", 3)
+    del state["vfe.pfn_layers.0.norm.bias"]
+    state["dense_head.conv_box.bias"] = torch.zeros(5)
+    state["neck.weight"] = torch.zeros(2, 2)
+    with pytest.raises(BeamboxError) as refusal:
+        import_checkpoint(write(tmp_path / "c.pth", state), "pointpillars")
+    text = str(refusal.value)
+    assert "vfe.pfn_layers.0.norm.bias is missing" in text
+    assert "dense_head.conv_box.bias has shape (5,), which does not make (42,)" in text
+    assert "neck.weight (2, 2) is unknown" in text
+
+
+def test_a_checkpoint_of_another_detector_is_refused(tmp_path):
+    _, state = checkpoint_of("second", 3)
+    path = write(tmp_path / "c.pth", state)
+    with pytest.raises(BeamboxError, match=r"does not fit pointpillars.*vfe.pfn_layers.0.linear.weight is missing"):
+        import_checkpoint(path, "pointpillars")
+    with pytest.raises(BeamboxError, match=r'called "secnd" \(did you mean "second"\?\)'):
+        import_checkpoint(path, "secnd")
+
+
+class Harm:
+    def __reduce__(self):
+        return print, ("code of the checkpoint ran",)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"not a checkpoint", "cannot read"),
+        (pickle.dumps({"model_state": Harm()}), "cannot read"),
+        (b"", "cannot read"),
+    ],
+)
+def test_unreadable_files_are_refused_and_no_code_runs(tmp_path, content, said, capsys):
+    path = tmp_path / "c.pth"
+    path.write_bytes(content)
+    with pytest.raises(BeamboxError, match=said):
+        import_checkpoint(path, "second")
+    assert capsys.readouterr().out == ""
+
+
+def test_files_without_a_model_state_are_refused(tmp_path):
+    path = tmp_path / "c.pth"
+    torch.save({"state_dict": {}}, path)
+    with pytest.raises(BeamboxError, match=r'must hold a dict "model_state".*state_dict'):
+        import_checkpoint(path, "second")
+    with pytest.raises(MissingFileError, match="no checkpoint"):
+        import_checkpoint(tmp_path / "absent.pth", "second")
+    write(path, {"dense_head.conv_cls.weight": torch.zeros(8, 4, 1, 1)})
+    with pytest.raises(BeamboxError, match="head for 2 classes; known are 1"):
+        import_checkpoint(path, "second")
+
+
+def test_the_command_writes_a_weight_file(tmp_path, capsys):
+    detector, state = checkpoint_of("pointpillars", 1)
+    out = tmp_path / "deep" / "car.safetensors"
+    command(write(tmp_path / "c.pth", state), "pointpillars", out)
+    assert "pointpillars (Car)" in capsys.readouterr().out
+    loaded = load_weights(out)
+    assert isinstance(loaded.config, PointPillarsConfig)
+    assert loaded.config.empty_slots
+    assert loaded.head.cls.weight.equal(detector.head.cls.weight)
