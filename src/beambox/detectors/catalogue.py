@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
 from beambox.checks import BeamboxError, did_you_mean
+from beambox.detectors.hcnet import HCNetConfig, hcnet
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
 from beambox.detectors.second import SecondConfig, second
 
@@ -25,6 +26,7 @@ class CatalogueEntry:
 
 
 CATALOGUE: dict[str, CatalogueEntry] = {
+    "hcnet": CatalogueEntry(HCNetConfig, hcnet),
     "pointpillars": CatalogueEntry(PointPillarsConfig, pointpillars),
     "second": CatalogueEntry(SecondConfig, second),
 }

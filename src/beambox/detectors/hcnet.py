@@ -1,0 +1,326 @@
+"""HCNet: point cloud object detection by height and channel attention (Zhang et al., Remote Sensing 13:5071, 2021).
+
+One stage, 2-D convolutions only. Points are gathered into pillars cut into P slices of height; each slice gives a
+pseudo image, height and channel attention merge the P images into one, and a head that sees that image again, and
+weighs rows and columns of its own map, finds the boxes::
+
+    points -> voxels -> PointNet -> P pseudo images -> HC module -> image -> backbone -> adaptive head -> boxes
+              0.16 x 0.16 x 1 m     P = 4, 496 x 432   sect. 3.2-3.4    |    sect. 3.5    sect. 3.6
+                                                                        +--------------------^
+
+The paper reports, for cars on KITTI's validation split, 3-D AP 88.45 / 78.01 / 76.72 (easy / moderate / hard; 11
+recalls) at 0.032 s on an RTX 2080 Ti. Weights trained on KITTI by its recipe are not available to compare with.
+
+Where the paper is silent or contradicts itself (``docs/hcnet.md`` tells each at length):
+
+* range: 70.4 x 80 m as printed does not fit 496 x 432 cells of 0.16 m (printed "90.16, 0.16, 10"); PointPillars'
+  69.12 x 79.36 m does;
+* the voxel network is only called "similar to PointNet": PointPillars' with 64 channels, shared by all slices, at most
+  32 points a voxel;
+* the product of the two attentions, "matrix multiplication", is read pixel by pixel: (C, 1) x (1, P); each pair of
+  1 x 1 convolutions has a ReLU between them and 4 or 16 hidden channels (without it they would be one linear map).
+  Weights lie in [0.5, 1), as a sigmoid follows two ReLUs;
+* widths and depths of backbone and head appear nowhere: PointPillars', and 128 in the head;
+* the "original pseudo images" that OIFM feeds into the head are taken to be the HC module's output; "a similar strategy
+  as CBAM" to be CBAM with reduction 16 and a 7 x 7 kernel;
+* AAM's convolutions are 3 x 1 and 1 x 3, and row and column weights are added; ReLU leaves the weights without a bound
+  (``aam_gate`` sigmoid bounds them);
+* equation 7 divides the height's difference by the anchor's diagonal while "the same loss function as SECOND" divides
+  by its height: SECOND's; its sine belongs to the loss, not to the target;
+* the anchors' height above the ground is missing: lower face at -1.78 m, as PointPillars;
+* optimiser, length of training, flip and post-processing are missing: PointPillars' of the public toolbox (recipes).
+
+Added: ``attention`` none (a plain maximum, which the paper's tables lack), any number of slices, several classes,
+``centred_anchors`` and ``absolute_xy`` as in PointPillars.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from beambox.checks import BeamboxError
+from beambox.detectors.contract import detections_from
+from beambox.geometry.grid import VoxelGrid
+from beambox.layers.anchors import AnchorClass, AnchorGrid
+from beambox.layers.attention import (
+    AdaptiveAdjustment,
+    Cbam,
+    Gate,
+    HeightChannelFusion,
+    HeightChannelKind,
+    pillar_stacks,
+)
+from beambox.layers.bev import conv_bn_relu, deconv_bn_relu
+from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss, select_boxes
+from beambox.layers.pillars import PillarFeatures
+from beambox.ops.scatter import scatter_bev
+from beambox.ops.voxelize import Voxels, voxelize
+from beambox.structures.batch import Batch
+from beambox.structures.detections import Detections
+from beambox.structures.labels import Labels
+
+__all__ = ["HCNET_CAR", "HCNET_SLICES", "HCNet", "HCNetConfig", "hcnet"]
+
+
+HCNET_SLICES = VoxelGrid((0.0, -39.68, -3.0), (69.12, 39.68, 1.0), (0.16, 0.16, 1.0))
+"""432 x 496 pillars of four slices in front of the sensor (HCNet, section 4.2; range see the module)."""
+
+HCNET_CAR = AnchorClass("Car", (3.9, 1.6, 1.5), -1.78, 0.60, 0.45)
+"""HCNet's car (section 4.2; the height above the ground is PointPillars')."""
+
+Three = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class HCNetConfig:
+    """Everything that defines the network; the defaults are the published KITTI setting, cars only."""
+
+    anchors: tuple[AnchorClass, ...] = (HCNET_CAR,)
+    """One anchor shape a class; also the classes and their order."""
+    grid: VoxelGrid = HCNET_SLICES
+    """Region in metres and voxel size; the number of cells in z is the number of pseudo images P."""
+    max_points: int = 32
+    """Points kept in a voxel, in scan order."""
+    max_voxels: int | None = 60000
+    """Voxels kept in a sweep, in order of first appearance; None keeps all."""
+    columns: int = 4
+    """Values of a point: x, y, z, intensity, ..."""
+    voxel_channels: int = 64
+    """Width C of the voxel features and pseudo images."""
+    absolute_xy: bool = True
+    """Whether a point's absolute x and y are among its features."""
+    attention: HeightChannelKind = HeightChannelKind.BOTH
+    """Weights of the pseudo images before their maximum: none, CA, HA or HCA (table 3)."""
+    height_hidden: int = 4
+    """Hidden channels of the height attention."""
+    channel_hidden: int = 16
+    """Hidden channels of the channel attention."""
+    depths: Three = (3, 5, 5)
+    """Convolutions of each stage after its first."""
+    strides: Three = (2, 2, 2)
+    """Stride of each stage's first convolution; the first is the stride of the anchors."""
+    widths: Three = (64, 128, 256)
+    """Channels of each stage."""
+    up_widths: Three = (128, 128, 128)
+    """Channels that each level contributes to the backbone's output."""
+    head_depth: int = 3
+    """Convolutions of the head's block after its first."""
+    head_width: int = 128
+    """Channels of the head's block, of its deblock and of the branch beside them."""
+    oifm: bool = True
+    """Whether the original information-fusion module feeds the pseudo image into the head (table 4)."""
+    oifm_width: int = 64
+    """Channels of the shrunken pseudo image."""
+    cbam_reduction: int = 16
+    """Channels of the fusion over hidden channels of its channel weights."""
+    aam: bool = True
+    """Whether the adaptive-adjustment module weighs the head's map (table 4)."""
+    aam_gate: Gate = Gate.RELU
+    """From convolutions to weights in it: relu (as published) or sigmoid."""
+    centred_anchors: bool = False
+    """Whether anchors stand at the centres of the map's cells."""
+    loss: LossWeights = field(default_factory=LossWeights)
+    """Weights of the losses (section 3.7: loc 2, cls 1, dir 0.2)."""
+    smooth_l1_beta: float = 1 / 9
+    """Where the regression loss turns linear."""
+    post: PostProcess = field(default_factory=PostProcess)
+    """Post-processing at test time."""
+
+    def __post_init__(self) -> None:
+        if not self.anchors:
+            raise BeamboxError("`anchors` must name at least one class, got none")
+        of_stages = {"depths": self.depths, "strides": self.strides, "widths": self.widths, "up_widths": self.up_widths}
+        for name, values in of_stages.items():
+            if len(values) != 3:
+                raise BeamboxError(f"`{name}` must have 3 entries, one a stage, got {len(values)}: {list(values)}")
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes."""
+        return tuple(anchor.name for anchor in self.anchors)
+
+    @property
+    def slices(self) -> int:
+        """Number of height slices, P in the paper."""
+        return self.grid.size[2]
+
+
+class HCNet(nn.Module):
+    """The network; see :class:`HCNetConfig`.
+
+    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`AnchorPredictions` over the map of stride 2.
+    With ``oifm`` or ``aam`` on, weights depend on averages over the whole map: the same place predicted from another
+    region (``grid``) may differ a little.
+    """
+
+    def __init__(self, config: HCNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.voxel_channels
+        self.anchors = AnchorGrid(config.anchors, config.grid, config.strides[0], config.centred_anchors)
+        self.voxel_net = PillarFeatures(width, config.columns, config.absolute_xy)
+        self.fuse_slices = HeightChannelFusion(
+            width, config.slices, config.attention, config.height_hidden, config.channel_hidden
+        )
+        self.backbone = PyramidBackbone(width, config.depths, config.strides, config.widths, config.up_widths)
+        self.adapt = AdaptiveHead(
+            self.backbone.out_channels,
+            width,
+            config.strides[0],
+            config.head_width,
+            config.head_depth,
+            OriginalInformation(config.oifm_width, config.cbam_reduction) if config.oifm else None,
+            config.aam_gate if config.aam else None,
+        )
+        self.head = AnchorHead(self.adapt.out_channels, self.anchors)
+
+    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> AnchorPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+        grid = self.config.grid if grid is None else grid
+        voxels = self.voxels(batch, grid)
+        features = self.voxel_net(voxels)  # (V, C)
+        stacks, pillars = pillar_stacks(features, voxels)  # (M, P, C), (M, 4)
+        fused = self.fuse_slices(stacks)  # (M, C)
+        image = scatter_bev(fused, pillars, batch.size, grid.shape[1:])  # (B, C, ny, nx)
+        bev = self.backbone(image)  # (B, 3 * 128, ny / 2, nx / 2)
+        adapted = self.adapt(bev, image)  # (B, 2 * 128, ny / 2, nx / 2)
+        return self.head(adapted, grid)
+
+    def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
+        """Gather points into voxels."""
+        config = self.config
+        if grid.size[2] != config.slices:
+            raise BeamboxError(f"`grid` must have the {config.slices} height slices of the network, got {grid.size[2]}")
+        points = batch.points[:, : config.columns]
+        return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
+
+    def loss(self, predictions: AnchorPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
+        """Return the weighted losses ``cls``, ``loc`` and ``direction``; objects of other classes are background."""
+        device = predictions.cls.device
+        known = [of_sample.of_classes(self.config.classes) for of_sample in labels]
+        return anchor_loss(
+            predictions,
+            [of_sample.boxes.to(device) for of_sample in known],
+            [of_sample.class_index(self.config.classes).to(device) for of_sample in known],
+            self.anchors,
+            self.config.loss,
+            self.config.smooth_l1_beta,
+        )
+
+    def decode(self, predictions: AnchorPredictions) -> list[Detections]:
+        """Return the detections of each sample, best first."""
+        return detections_from(select_boxes(predictions, self.config.post), self.config.classes)
+
+
+class PyramidBackbone(nn.Module):
+    """The YOLO-like backbone (section 3.5, figure 7): down three stages, back up beside them, all levels joined."""
+
+    def __init__(self, in_channels: int, depths: Three, strides: Three, widths: Three, up_widths: Three) -> None:
+        super().__init__()
+        (w1, w2, w3), (_, s2, s3) = widths, strides
+        self.block1 = block(in_channels, w1, depths[0], strides[0])
+        self.block2 = block(w1, w2, depths[1], s2)
+        self.block3 = block(w2, w3, depths[2], s3)
+        self.deblock3 = deblock(w3, w2, s3)
+        self.deblock2 = deblock(w2 + w2, w1, s2)
+        self.up1 = deconv_bn_relu(w1 + w1, up_widths[0], 1, 1)
+        self.up2 = deconv_bn_relu(w2 + w2, up_widths[1], s2, s2)
+        self.up3 = deconv_bn_relu(w3, up_widths[2], s2 * s3, s2 * s3)
+        self.out_channels = sum(up_widths)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, out_channels, Y / s, X / s)``, s the first stage's stride."""
+        top1 = self.block1(image)  # (B, 64, Y / 2, X / 2)
+        top2 = self.block2(top1)  # (B, 128, Y / 4, X / 4)
+        top3 = self.block3(top2)  # (B, 256, Y / 8, X / 8)
+        down2 = join(top2, self.deblock3(top3))  # (B, 256, Y / 4, X / 4)
+        down1 = join(top1, self.deblock2(down2))  # (B, 128, Y / 2, X / 2)
+        return join(self.up1(down1), self.up2(down2), self.up3(top3))  # (B, 384, Y / 2, X / 2)
+
+
+@dataclass(frozen=True)
+class OriginalInformation:
+    """What the original information-fusion module is made of."""
+
+    width: int = 64
+    """Channels of the shrunken pseudo image."""
+    reduction: int = 16
+    """Of its channel weights."""
+
+
+class OriginalFusion(nn.Module):
+    """The original information-fusion module (section 3.6.2): join the shrunken pseudo image, weigh by CBAM."""
+
+    def __init__(self, channels: int, image_channels: int, strides: Sequence[int], of: OriginalInformation) -> None:
+        super().__init__()
+        steps = [conv_bn_relu(image_channels, of.width, stride=strides[0])]
+        steps += [conv_bn_relu(of.width, of.width, stride=stride) for stride in strides[1:]]
+        self.shrink = nn.Sequential(*steps)
+        self.out_channels = channels + of.width
+        self.weigh = Cbam(self.out_channels, of.reduction)
+
+    def forward(self, bev: Tensor, image: Tensor) -> Tensor:
+        """Map ``(B, channels, Y / s, X / s)`` and the image ``(B, C, Y, X)`` to ``(B, out_channels, Y / s, X / s)``."""
+        return self.weigh(join(bev, self.shrink(image)))
+
+
+class AdaptiveHead(nn.Module):
+    """The adaptively adjusted head before its last convolutions (section 3.6, figure 8); both modules are optional."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        image_channels: int,
+        stride: int,
+        width: int,
+        depth: int,
+        original: OriginalInformation | None,
+        gate: Gate | None,
+    ) -> None:
+        super().__init__()
+        wide, deep = in_channels, width
+        self.fuse1, self.fuse2 = None, None
+        if original is not None:
+            self.fuse1 = OriginalFusion(in_channels, image_channels, (stride,), original)
+            self.fuse2 = OriginalFusion(width, image_channels, (stride, 2), original)
+            wide, deep = self.fuse1.out_channels, self.fuse2.out_channels
+        self.skip = conv_bn_relu(wide, width, kernel=1)
+        self.block = block(wide, width, depth, 2)
+        self.deblock = deblock(deep, width, 2)
+        self.out_channels = 2 * width
+        self.adjust = None if gate is None else AdaptiveAdjustment(self.out_channels, gate)
+
+    def forward(self, bev: Tensor, image: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y / s, X / s)``, with the pseudo image ``(B, C, Y, X)``, to ``out_channels``."""
+        bev = bev if self.fuse1 is None else self.fuse1(bev, image)  # (B, 384 + 64, Y / 2, X / 2)
+        deep = self.block(bev)  # (B, 128, Y / 4, X / 4)
+        deep = deep if self.fuse2 is None else self.fuse2(deep, image)  # (B, 128 + 64, Y / 4, X / 4)
+        both = join(self.skip(bev), self.deblock(deep))  # (B, 256, Y / 2, X / 2)
+        return both if self.adjust is None else self.adjust(both)
+
+
+def block(in_channels: int, width: int, depth: int, stride: int) -> nn.Sequential:
+    """A convolution with a stride and ``depth`` further ones, 3 x 3."""
+    return nn.Sequential(
+        conv_bn_relu(in_channels, width, stride=stride), *(conv_bn_relu(width, width) for _ in range(depth))
+    )
+
+
+def deblock(in_channels: int, width: int, stride: int) -> nn.Sequential:
+    """A transposed 3 x 3 convolution that undoes a stride."""
+    return deconv_bn_relu(in_channels, width, 3, stride, padding=1, output_padding=stride - 1)
+
+
+def join(first: Tensor, *others: Tensor) -> Tensor:
+    """Join maps along the channels, cut to the first one's size (an odd size halved and doubled is one larger)."""
+    height, width = first.shape[-2:]
+    return torch.cat([first, *(other[..., :height, :width] for other in others)], dim=1)
+
+
+def hcnet(config: HCNetConfig | None = None) -> HCNet:
+    """Build HCNet; without a configuration, the published KITTI one for cars (7.1 M parameters)."""
+    return HCNet(config or HCNetConfig())
