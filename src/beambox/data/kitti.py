@@ -9,7 +9,7 @@
         calib/000000.txt                      needed for labels and for the camera's view
         label_2/000000.txt                    optional
         image_2/000000.png                    optional; without it 1242 x 375 pixels are assumed
-        planes/000000.txt                     optional road planes; without them one is fitted to the points
+        planes/000000.txt                     optional road planes; without them augmentation fits its own
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from beambox.data.kitti_text import (
     read_labels,
     read_results,
 )
-from beambox.data.road import fit_road_plane
 from beambox.geometry import Calibration
 from beambox.structures import Frame, Labels
 
@@ -118,7 +117,7 @@ class KittiSource:
             calibration=calibration,
             image_path=image_path,
             image_size=self.image_size(index) if calibration is not None else None,
-            plane=self._plane(name, calibration, raw),
+            plane=self._plane(name, calibration),
             notes=notes,
         )
         return frame.camera_view() if self.fov else frame
@@ -167,11 +166,11 @@ class KittiSource:
             return None
         return read_labels(path, calibration)
 
-    def _plane(self, name: str, calibration: Calibration | None, points: torch.Tensor) -> torch.Tensor | None:
+    def _plane(self, name: str, calibration: Calibration | None) -> torch.Tensor | None:
         path = self.path("planes", name)
-        if calibration is not None and path.exists():
-            return parse_plane(read_text(path), calibration, str(path))
-        return fit_road_plane(points)
+        if calibration is None or not path.exists():
+            return None
+        return parse_plane(read_text(path), calibration, str(path))
 
 
 def _frame_folder(root: Path, part: str) -> Path:

@@ -14,15 +14,21 @@ REACH = 40.0
 """Points farther away than this do not vote, metres."""
 FEWEST_CELLS = 12
 """Fewer cells than this do not make a plane."""
-WIDTHS = (1.0, 0.5, 0.3, 0.2, 0.15, 0.15)
+GUESSES = 40
+"""Planes through three cells that are tried first."""
+STEEPEST = 0.2
+"""Guesses with a steeper slope are left out; the others lose votes in proportion, a quarter at the steepest."""
+STEEPNESS_COST = 0.25
+WIDTHS = (0.4, 0.3, 0.2, 0.15)
 """Distance at which a cell loses all its say, one entry a round of the fit, metres."""
 
 
 def fit_road_plane(points: Tensor) -> Tensor | None:
     """Fit a plane to the ground of a sweep.
 
-    The low point of every 2 m cell within 40 m votes; a plane is fitted to them by least squares, reweighted with
-    Tukey's biweight of shrinking width, so that cars, walls and stray returns below the ground lose their say.
+    The low point of every 2 m cell within 40 m votes. Of planes through three cells each (always the same choice of
+    cells, so that a sweep has one answer) the one near most cells is refined by least squares, reweighted with Tukey's
+    biweight of shrinking width: cars, walls and stray returns below the ground lose their say.
 
     Args:
         points: ``(N, 3 or more)`` x, y, z in metres, z up.
@@ -53,16 +59,26 @@ def fit_road_plane(points: Tensor) -> Tensor | None:
 
 
 def _robust_fit(design: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Fit z = design @ (slope x, slope y, height): start level at the commonest low height, then reweight."""
-    heights = np.sort(z)
-    width = max(2, len(heights) // 4)
-    spread = heights[width - 1 :] - heights[: len(heights) - width + 1]
-    start = int(spread.argmin())  # the densest quarter of the heights
-    solution = np.array([0.0, 0.0, np.median(heights[start : start + width])])
+    """Fit z = design @ (slope x, slope y, height) to ``(M, 3)`` and ``(M,)``, most of which may be off the plane."""
+    solution = _best_guess(design, z)
     for limit in WIDTHS:
         ratio = (z - design @ solution) / limit
         weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-        # a ridge of a tenth of a cell keeps the slopes from running away where the cells lie in a line
-        normal = design.T @ (weight[:, None] * design) + np.diag([1.0, 1.0, 1e-6])
-        solution = np.linalg.solve(normal, design.T @ (weight * z) + np.array([0.0, 0.0, 1e-6 * solution[2]]))
+        # a faint pull to the last solution keeps the slopes from running away where the cells lie in a line
+        pull = np.diag([1.0, 1.0, 1e-6])
+        solution = np.linalg.solve(
+            design.T @ (weight[:, None] * design) + pull, design.T @ (weight * z) + pull @ solution
+        )
     return solution
+
+
+def _best_guess(design: np.ndarray, z: np.ndarray) -> np.ndarray:
+    triples = np.random.default_rng(0).integers(0, len(z), (GUESSES, 3))
+    corners = design[triples]  # (G, 3, 3)
+    apart = np.abs(np.linalg.det(corners)) > 10.0  # twice the triangle's area, square metres
+    level = np.array([0.0, 0.0, np.median(z)])
+    guesses = np.linalg.solve(corners[apart], z[triples[apart], None])[..., 0]  # (G', 3)
+    guesses = np.concatenate((level[None], guesses))
+    steepness = np.hypot(guesses[:, 0], guesses[:, 1]) / STEEPEST
+    votes = (np.abs(z - guesses @ design.T) < WIDTHS[0] / 2).sum(axis=1)  # (G' + 1,)
+    return guesses[(votes * (1 - STEEPNESS_COST * steepness) * (steepness < 1)).argmax()]

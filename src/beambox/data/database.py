@@ -1,0 +1,222 @@
+"""Labelled objects cut out of their sweeps, to be placed into others (SECOND, section 3.2: ground-truth sampling)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beambox.checks import BeamboxError, did_you_mean, expect_same_length
+from beambox.data.files import replacing
+from beambox.data.footprints import inside_box, overlap_bev
+from beambox.data.formats.columns import decode
+from beambox.data.source import FrameSource
+from beambox.data.walk import walk
+
+__all__ = ["ObjectDatabase"]
+
+FORMAT = "beambox objects 1"
+
+
+@dataclass(frozen=True)
+class ObjectDatabase:
+    """Objects with their points, one after the other."""
+
+    boxes: np.ndarray
+    """``(K, 7)`` float32 boxes where the objects stood, LiDAR frame."""
+    points: np.ndarray
+    """``(P, C)`` float32 points of all objects, x, y, z relative to their box's centre (not turned)."""
+    offsets: np.ndarray
+    """``(K + 1,)`` int64: object k owns rows ``offsets[k]`` to ``offsets[k + 1]``."""
+    labels: np.ndarray
+    """``(K,)`` int64 position in ``classes``."""
+    classes: tuple[str, ...]
+    """Names of the classes."""
+    frames: tuple[str, ...]
+    """``(K,)`` name of the frame each object was cut from."""
+
+    def __post_init__(self) -> None:
+        expect_same_length(boxes=len(self.boxes), labels=len(self.labels), frames=len(self.frames))
+        expect_same_length(offsets=len(self.offsets), objects_plus_one=len(self.boxes) + 1)
+        members = tuple(np.flatnonzero(self.labels == k) for k in range(len(self.classes)))
+        object.__setattr__(self, "_members", members)
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def counts(self) -> dict[str, int]:
+        """Number of objects of each class."""
+        return {name: int((self.labels == k).sum()) for k, name in enumerate(self.classes)}
+
+    @classmethod
+    def build(
+        cls,
+        source: FrameSource,
+        classes: Sequence[str],
+        min_points: int = 5,
+        drop_unknown_difficulty: bool = True,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> ObjectDatabase:
+        """Cut the objects out of every frame.
+
+        Args:
+            source: labelled frames with their whole sweeps: do not crop them to the camera's view.
+            classes: names to keep.
+            min_points: objects with fewer points are left out.
+            drop_unknown_difficulty: leave out objects beyond KITTI's level "hard", where labels tell.
+            progress: called with (frames done, frames in all).
+
+        Raises:
+            BeamboxError: if a frame has no labels, or frames differ in their point columns.
+        """
+        boxes, chunks, labels, frames = [], [], [], []
+        columns = 4
+        for number in range(len(source)):
+            frame = source[number]
+            if frame.labels is None:
+                raise BeamboxError(f"an object database needs labelled frames, but {frame.id or number} has no labels")
+            if chunks and frame.points.shape[1] != columns:
+                raise BeamboxError(
+                    f"all frames need the same point columns: {frame.id} has {frame.points.shape[1]}, others {columns}"
+                )
+            columns = frame.points.shape[1]
+            keep = frame.labels.class_index(classes)
+            if drop_unknown_difficulty and frame.labels.attributes is not None:
+                keep[frame.labels.attributes.difficulty() < 0] = -1
+            cloud, all_boxes = frame.points.numpy(), frame.labels.boxes.numpy()
+            for k in np.flatnonzero(keep.numpy() >= 0):
+                rows = inside_box(cloud, all_boxes[k].astype(np.float64))
+                if len(rows) < max(1, min_points):
+                    continue
+                own = cloud[rows].copy()
+                own[:, :3] -= all_boxes[k, :3]
+                boxes.append(all_boxes[k])
+                chunks.append(own)
+                labels.append(int(keep[k]))
+                frames.append(frame.id)
+            if progress is not None:
+                progress(number + 1, len(source))
+        lengths = [len(own) for own in chunks]
+        return cls(
+            boxes=np.array(boxes, dtype=np.float32).reshape(-1, 7),
+            points=np.concatenate(chunks) if chunks else np.zeros((0, columns), dtype=np.float32),
+            offsets=np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
+            labels=np.array(labels, dtype=np.int64),
+            classes=tuple(classes),
+            frames=tuple(frames),
+        )
+
+    def save(self, path: Path | str) -> None:
+        """Write one .npz file."""
+        with replacing(Path(path)) as stream:
+            np.savez(
+                stream,
+                format=np.array(FORMAT),
+                boxes=self.boxes,
+                points=self.points,
+                offsets=self.offsets,
+                labels=self.labels,
+                classes=np.array(self.classes, dtype=np.str_),
+                frames=np.array(self.frames, dtype=np.str_),
+            )
+
+    @classmethod
+    def load(cls, path: Path | str) -> ObjectDatabase:
+        """Read a file that :meth:`save` wrote.
+
+        Raises:
+            BeamboxError: if it is another kind of file.
+        """
+        path = Path(path)
+
+        def read() -> ObjectDatabase:
+            with np.load(path, allow_pickle=False) as file:
+                if "format" not in file.files or str(file["format"]) != FORMAT:
+                    raise BeamboxError(f"{path} is not an object database of this version; build it again")
+                return cls(
+                    *(file[name] for name in ("boxes", "points", "offsets", "labels")),
+                    classes=tuple(file["classes"].tolist()),
+                    frames=tuple(file["frames"].tolist()),
+                )
+
+        return decode(path, "object database", read)
+
+    @classmethod
+    def joined(cls, databases: Sequence[ObjectDatabase]) -> ObjectDatabase:
+        """Join the objects of several databases, such as simulated and real ones; columns must agree."""
+        columns = {database.points.shape[1] for database in databases}
+        if len(columns) != 1:
+            raise BeamboxError(f"databases to join need the same point columns, got {sorted(columns) or 'none'}")
+        classes = tuple(dict.fromkeys(name for database in databases for name in database.classes))
+        lengths = np.concatenate([np.diff(database.offsets) for database in databases])
+        return cls(
+            boxes=np.concatenate([database.boxes for database in databases]),
+            points=np.concatenate([database.points for database in databases]),
+            offsets=np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
+            labels=np.concatenate(
+                [np.array([classes.index(c) for c in db.classes], dtype=np.int64)[db.labels] for db in databases]
+            ),
+            classes=classes,
+            frames=tuple(name for database in databases for name in database.frames),
+        )
+
+    def draw(self, name: str, count: int, turn: int, seed: int) -> np.ndarray:
+        """Return the objects that the ``turn``-th draw of ``count`` takes: a shuffled walk, each once a pass.
+
+        Args:
+            name: class to draw from.
+            count: how many; fewer come where the class has fewer.
+            turn: number of the draw, 0 for the first of a run; a pure function of it and the seed.
+            seed: names the walk.
+
+        Returns:
+            ``(count or fewer,)`` int64 numbers of objects.
+        """
+        if name not in self.classes:
+            raise BeamboxError(f'the object database has no class "{name}"{did_you_mean(name, self.classes)}')
+        kind = self.classes.index(name)
+        members = self._members[kind]  # type: ignore[attr-defined]
+        count = min(count, len(members))
+        if count == 0:
+            return np.zeros(0, dtype=np.int64)
+        return np.unique(members[walk(len(members), turn * count, count, (seed, kind))])
+
+    def sample(
+        self, existing: np.ndarray, wanted: Sequence[tuple[str, int]], turn: int, seed: int
+    ) -> tuple[np.ndarray, list[str]]:
+        """Draw objects that stand free: classes in turn, colliding candidates left out (both, where two collide).
+
+        Args:
+            existing: ``(N, 7)`` boxes already in the frame.
+            wanted: (class, count) in the order of drawing.
+            turn: number of the draw; see :meth:`draw`.
+            seed: names the walk.
+
+        Returns:
+            ``(K,)`` int64 numbers of the accepted objects and their class names.
+        """
+        taken: list[np.ndarray] = []
+        names: list[str] = []
+        for name, count in wanted:
+            drawn = self.draw(name, count, turn, seed)
+            candidates = self.boxes[drawn]  # (n, 7)
+            among = overlap_bev(candidates[:, None], candidates)  # (n, n)
+            np.fill_diagonal(among, False)
+            free = ~(among.any(axis=1) | overlap_bev(candidates[:, None], existing).any(axis=1))
+            taken.append(drawn[free])
+            names += [name] * int(free.sum())
+            existing = np.concatenate((existing, candidates[free]))
+        return np.concatenate(taken) if taken else np.zeros(0, dtype=np.int64), names
+
+    def points_of(self, objects: np.ndarray, centres: np.ndarray) -> np.ndarray:
+        """Return the points of some objects, carried to given centres: ``(K,)``, ``(K, 3)`` -> ``(P, C)`` float32."""
+        first = self.offsets[objects]
+        lengths = self.offsets[objects + 1] - first
+        ends = np.cumsum(lengths)
+        total = int(ends[-1]) if len(ends) else 0
+        rows = np.repeat(first - (ends - lengths), lengths) + np.arange(total)
+        points = self.points[rows]  # a copy: advanced indexing
+        points[:, :3] += np.repeat(centres.astype(np.float32), lengths, axis=0)
+        return points
