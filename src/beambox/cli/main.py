@@ -19,6 +19,10 @@ __all__ = ["COMMANDS", "main"]
 COMMANDS: dict[str, tuple[str, str]] = {
     "detect": ("beambox.cli.detect", "find objects in sweeps: files, folders, patterns"),
     "show": ("beambox.cli.show", "draw sweeps from above, with boxes, and the boxes into the camera image"),
+    "train": ("beambox.cli.train", "train a detector by a recipe"),
+    "evaluate": ("beambox.cli.evaluate", "detect in a labelled data set and score by KITTI's rules"),
+    "models": ("beambox.cli.models", "the shipped weights and where they come from"),
+    "doctor": ("beambox.cli.doctor", "why does nothing work, or why are there no detections"),
 }
 
 EXAMPLES = (
@@ -27,7 +31,7 @@ EXAMPLES = (
     ("beambox show scan.bin --model pointpillars-sim --out scan.png", "and look at them"),
     ("beambox doctor scan.bin", "why are there no detections?"),
     ("beambox simulate data --frames 200 --seed 1", "make a labelled data set"),
-    ("beambox train recipes/pointpillars-sim.yaml --data data --out run", "train on it"),
+    ("beambox train recipes/pointpillars_sim.yaml --data data --out run", "train on it"),
     ("beambox evaluate run --data data", "and score the result"),
 )
 

@@ -227,7 +227,7 @@ def find_weights(name: str | Path) -> Path:
             )
         return path
     if path.is_dir():
-        for file in ("best.safetensors", "last.safetensors", "model.safetensors"):
+        for file in ("best.safetensors", "final.safetensors"):
             if (path / file).is_file():
                 return path / file
         found = sorted(path.glob("*.safetensors"))

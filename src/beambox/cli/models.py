@@ -1,0 +1,42 @@
+"""`beambox models`: the shipped weights and where they come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["command"]
+
+
+def command(
+    name: Annotated[
+        str, typer.Argument(metavar="[MODEL]", help="Shipped name or weight file: print its whole card.")
+    ] = "",
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="Write all cards here.")] = None,
+) -> None:
+    """List the shipped weights, or print the card of one.
+
+    Examples:
+      beambox models
+      beambox models pointpillars-sim
+      beambox models run/best.safetensors
+    """
+    import json
+
+    from beambox.data.files import write_text
+    from beambox.infer.cards import card_text, read_card
+    from beambox.infer.predictor import find_weights
+    from beambox.zoo import shipped
+
+    if name:
+        print(card_text(read_card(find_weights(name))))
+        return
+    cards = [read_card(path) for path in shipped().values()]
+    if json_file is not None:
+        write_text(json_file, json.dumps([card.to_json() for card in cards], indent=2) + "\n")
+    if not cards:
+        print("no weights are shipped with this installation; `beambox train` makes some")
+    for card in cards:
+        print(card.line())
