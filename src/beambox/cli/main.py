@@ -8,21 +8,23 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Sequence
-from importlib import import_module
+from typing import NoReturn
 
 from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean
 
 __all__ = ["COMMANDS", "main"]
 
-# name -> (module whose `command` function it is, what it does in one line)
+# name -> (module:function, or module:app for a command with commands of its own; what it does in one line)
 COMMANDS: dict[str, tuple[str, str]] = {
-    "detect": ("beambox.cli.detect", "find objects in sweeps: files, folders, patterns"),
-    "show": ("beambox.cli.show", "draw sweeps from above, with boxes, and the boxes into the camera image"),
-    "train": ("beambox.cli.train", "train a detector by a recipe"),
-    "evaluate": ("beambox.cli.evaluate", "detect in a labelled data set and score by KITTI's rules"),
-    "models": ("beambox.cli.models", "the shipped weights and where they come from"),
-    "doctor": ("beambox.cli.doctor", "why does nothing work, or why are there no detections"),
+    "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns"),
+    "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
+    "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
+    "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
+    "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
+    "train": ("beambox.cli.train:command", "train a detector by a recipe"),
+    "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
+    "score": ("beambox.cli.score:app", "score result files of any detector by the rules of KITTI or ONCE"),
 }
 
 EXAMPLES = (
@@ -85,7 +87,7 @@ def explain(error: OSError) -> str:
     return f"{where}{what}{hint}"
 
 
-def stop(message: str, status: int) -> None:
+def stop(message: str, status: int) -> NoReturn:
     """Print one line on stderr and leave."""
     line = " ".join(message.split())
     print(f"beambox: {line}", file=sys.stderr)
@@ -116,15 +118,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def run(name: str, arguments: Sequence[str]) -> None:
     """Import one command's module and hand it its arguments."""
+    from importlib.metadata import EntryPoint
+
     import typer
 
-    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    settings = {"help_option_names": ["-h", "--help"]}
     try:
-        module = import_module(COMMANDS[name][0])
+        command = EntryPoint(name, COMMANDS[name][0], "beambox").load()
     except KeyboardInterrupt:
         stop("interrupted", 130)
-    app.command(name, help=help_of(module.command), context_settings=settings)(guard(module.command))
+    if isinstance(command, typer.Typer):
+        app = command
+    else:
+        app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+        settings = {"help_option_names": ["-h", "--help"]}
+        app.command(name, help=help_of(command), context_settings=settings)(guard(command))
     app(args=list(arguments), prog_name=f"beambox {name}")
 
 

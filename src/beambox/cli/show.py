@@ -108,7 +108,7 @@ def region_of_option(area: str) -> Region | None:
     numbers = options.parse_range(area, "--area")
     if numbers is None:
         return None
-    return Region(-numbers, -numbers, numbers, numbers) if isinstance(numbers, float) else Region(*numbers)
+    return Region(*numbers) if isinstance(numbers, list) else Region(-numbers, -numbers, numbers, numbers)
 
 
 def picture_paths(sweeps: list[Sweep], out: Path) -> list[Path]:

@@ -43,7 +43,7 @@ class Detector:
 
     def __init__(
         self,
-        model: nn.Module,
+        model: Any,
         *,
         card: Mapping[str, Any] | None = None,
         device: str | torch.device | None = None,
@@ -75,15 +75,15 @@ class Detector:
         self.device = choose_device(device)
         self.dtype = choose_precision(precision, self.device)
         self.card = dict(card or {})
-        self.config = model.config
-        self.grid = grid or model.config.grid
+        self.config: Any = model.config
+        self.grid: VoxelGrid = grid or self.config.grid
         self.view: View = view
         self.corrections = corrections or Corrections()
         self.intensity_scale = intensity_scale
         self.fields = fields
         self.batch_size = batch_size
         folded = fold_batch_norms(model.eval()).to(self.device)
-        self.model: Any = folded.to(memory_format=torch.channels_last)
+        self.model: Any = channels_last(folded)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -112,7 +112,7 @@ class Detector:
             for start in range(0, len(given), self.batch_size):
                 found += self.detect([self.read(one) for one in given[start : start + self.batch_size]])
             return found
-        return self.detect([self.read(given)])[0]
+        return self.detect([self.read(given)])[0]  # pyright: ignore[reportArgumentType]
 
     def read(self, given: Input | Sweep) -> Frame:
         """Turn any input into a frame; nothing is corrected yet."""
@@ -180,6 +180,14 @@ class Detector:
             self.corrections.carry_back(replace(found.to("cpu"), frame_id=frame.id))
             for found, frame in zip(decoded, frames)
         ]
+
+
+def channels_last(model: nn.Module) -> nn.Module:
+    """Lay out the weights of convolutions so that their maps keep the channels of a cell together."""
+    for layer in model.modules():
+        if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+            layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
+    return model
 
 
 def region(model_grid: VoxelGrid, wanted: float | Sequence[float] | VoxelGrid) -> VoxelGrid:
@@ -276,14 +284,14 @@ def load(
     """
     path = find_weights(name)
     chosen = choose_device(device)
-    model = load_weights(path, "cpu")
+    model: Any = load_weights(path, "cpu")
     card = read_weights(path).card
     trained = float(card.get("sensor_height", KITTI_SENSOR_HEIGHT))
     corrections = Corrections(
         axes=Axes.parse(axes) if isinstance(axes, str) else axes or Axes(),
         raise_by=0.0 if sensor_height is None else sensor_height - trained,
     )
-    grid: VoxelGrid = model.config.grid  # pyright: ignore[reportAssignmentType, reportAttributeAccessIssue]
+    grid: VoxelGrid = model.config.grid
     return Detector(
         model,
         card=card,

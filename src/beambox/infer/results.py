@@ -49,9 +49,9 @@ def format_json(detections: Detections, model: str) -> str:
 def format_csv(detections: Detections) -> str:
     """Write detections as CSV with a header line; the columns are those of the JSON's objects and the frame."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(_rounded(detections))
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows([row[key] for key in COLUMNS] for row in _rounded(detections))
     return text.getvalue()
 
 

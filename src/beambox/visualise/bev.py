@@ -49,7 +49,7 @@ class _Map:
         r = self.region
         return round((r.y_max - r.y_min) * self.scale), round((r.x_max - r.x_min) * self.scale)
 
-    def pixels(self, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+    def pixels(self, xy: NDArray[np.floating]) -> NDArray[np.floating]:
         """Carry ``(..., 2)`` x, y in metres to u, v."""
         u = (self.region.y_max - xy[..., 1]) * self.scale
         v = (self.region.x_max - xy[..., 0]) * self.scale
@@ -171,11 +171,11 @@ def _draw_border(canvas: Canvas, view: _Map, looked_at: Region) -> None:
     canvas.dashes([(float(u), float(v)) for u, v in corners], MUTED, width=0.75, dash=5)
 
 
-def _outline(view: _Map, boxes: torch.Tensor) -> NDArray[np.float64]:
+def _outline(view: _Map, boxes: torch.Tensor) -> NDArray[np.floating]:
     return view.pixels(corners_bev(boxes.cpu().double()).numpy())  # (N, 4, 2)
 
 
-def _draw_heading(canvas: Canvas, corners: NDArray[np.float64], colour: Colour, width: float, alpha: int) -> None:
+def _draw_heading(canvas: Canvas, corners: NDArray[np.floating], colour: Colour, width: float, alpha: int) -> None:
     front = (corners[0] + corners[3]) / 2
     centre = corners.mean(axis=0)
     canvas.line((tuple(centre), tuple(front)), colour, width, alpha)
@@ -211,19 +211,19 @@ def score_alpha(score: float) -> int:
 class _Tags:
     """Words beside boxes, each where it covers no other; a tag without room is left out."""
 
-    def __init__(self, canvas: Canvas, width: int, height: int, boxes: NDArray[np.float64] | None) -> None:
+    def __init__(self, canvas: Canvas, width: int, height: int, boxes: NDArray[np.floating] | None) -> None:
         self.canvas, self.width, self.height = canvas, width, height
         self._taken: list[tuple[float, float, float, float]] = []
         for corners in () if boxes is None else boxes:  # words do not cover boxes either
             (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
             self._taken.append((u0, v0, u1, v1))
 
-    def add_all(self, outlines: NDArray[np.float64], words: Sequence[tuple[str, Colour]]) -> None:
+    def add_all(self, outlines: NDArray[np.floating], words: Sequence[tuple[str, Colour]]) -> None:
         """Write beside boxes of ``(N, 4, 2)`` pixels; the first ones get the best places."""
         for corners, (text, colour) in zip(outlines, words):
             self._add(corners, text, colour)
 
-    def _add(self, corners: NDArray[np.float64], words: str, colour: Colour, size: float = 11) -> None:
+    def _add(self, corners: NDArray[np.floating], words: str, colour: Colour, size: float = 11) -> None:
         half, tall = self.canvas.text_width(words, size) / 2, size * 0.6
         (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
         middle_u, middle_v = (u0 + u1) / 2, (v0 + v1) / 2
