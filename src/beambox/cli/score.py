@@ -40,14 +40,12 @@ def parse_overlaps(text: str) -> dict[str, float]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON beside the target first, so that no half-written file remains."""
+    """Write numbers for other programs."""
     import json
-    import os
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(beside, path)
+    from beambox.data.files import write_text
+
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 @app.command()

@@ -110,7 +110,7 @@ def evaluate(
     """
     pairs, known = [], {}
     for number, entry in enumerate(frames):
-        frame = KittiFrame(*entry)
+        frame = entry if isinstance(entry, KittiFrame) else KittiFrame(*entry)
         known.update(dict.fromkeys(frame.detections.classes))
         calibration = None if no_difficulty else frame.calibration
         truth = objects_from_labels(frame.labels, calibration)

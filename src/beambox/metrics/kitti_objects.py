@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,7 @@ def parse_objects(text: str, where: str, scored: bool) -> Objects:
             values = [float(part) for part in parts[1:wanted]]
         except ValueError as error:
             raise BeamboxError(f"{where}, line {number}: expected numbers after the type, {error}") from error
-        if not all(map(np.isfinite, values)):
+        if not all(map(math.isfinite, values)):
             raise BeamboxError(f"{where}, line {number}: expected finite numbers, got {line.strip()!r}")
         if parts[0].lower() == "dontcare":
             ignored.append(values[3:7])
@@ -123,9 +124,12 @@ def objects_from_labels(labels: Labels, calibration: Calibration | None) -> Obje
     size = len(labels)
     box, image, alpha = boxes.numpy(), np.zeros((size, 4)), np.full(size, -10.0)
     truncation, occlusion = np.zeros(size), np.zeros(size)
+    attributes = labels.attributes
     if calibration is not None:
         box = _from_camera(calibration.to_camera(boxes))[0]
-    attributes = labels.attributes
+        if attributes is not None and attributes.camera is not None:  # exactly as the label file has it
+            size_there, location, turn = attributes.camera.double().split((3, 3, 1), dim=1)
+            box = _planar(location.numpy(), size_there.numpy(), turn[:, 0].numpy())
     if attributes is not None:
         truncation, occlusion = attributes.truncation.double().numpy(), attributes.occlusion.double().numpy()
         image, alpha = attributes.image.double().numpy(), attributes.alpha.double().numpy()
