@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
 from beambox.ops.nms import reference
 
 __all__ = ["nms"]
@@ -20,7 +20,17 @@ def _numba() -> Callable[..., Tensor]:
     return cpu.nms
 
 
-BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.nms))
+def _triton() -> Callable[..., Tensor]:
+    from beambox.ops.nms import gpu
+
+    return gpu.nms
+
+
+BACKENDS = (
+    Backend("triton", can_run_triton, _triton),
+    Backend("numba", can_run_numba, _numba),
+    Backend("reference", always, lambda: reference.nms),
+)
 
 
 def nms(boxes: Tensor, scores: Tensor, threshold: float, pre: int = 4096, post: int = 500) -> Tensor:

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from beambox.ops.jit import jit
-from beambox.ops.rotated_iou.cpu import prepare, shared_area
+from beambox.ops.rotated_iou.cpu import shared_area
+from beambox.ops.rotated_iou.prepared import prepare
 
 __all__ = ["nms"]
 
@@ -15,7 +16,7 @@ __all__ = ["nms"]
 def nms(boxes: Tensor, scores: Tensor, threshold: float, pre: int = 4096, post: int = 500) -> Tensor:
     """Keep the best boxes that do not overlap a better one; see :func:`beambox.ops.nms.nms`."""
     order = scores.argsort(descending=True, stable=True)[:pre]
-    kept = _greedy(prepare(boxes[order]), float(threshold), min(post, len(order)))
+    kept = _greedy(prepare(boxes[order]).numpy(), float(threshold), min(post, len(order)))
     return order[torch.from_numpy(kept)]
 
 

@@ -7,16 +7,21 @@ from collections.abc import Callable
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, choose, needs_gradient
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose, needs_gradient
 from beambox.ops.rotated_iou import reference
 
 __all__ = ["intersection_bev", "iou_3d", "iou_bev"]
 
 
+WITH_GRADIENT = "a box requires a gradient, which the reference alone gives"
+
+
 def _can_run_numba(a: Tensor, b: Tensor) -> str | None:
-    if needs_gradient(a, b):
-        return "a box requires a gradient, which the reference alone gives"
-    return can_run_numba(a, b)
+    return WITH_GRADIENT if needs_gradient(a, b) else can_run_numba(a, b)
+
+
+def _can_run_triton(a: Tensor, b: Tensor) -> str | None:
+    return WITH_GRADIENT if needs_gradient(a, b) else can_run_triton(a, b)
 
 
 def _numba_bev() -> Callable[..., Tensor]:
@@ -37,9 +42,36 @@ def _numba_area() -> Callable[..., Tensor]:
     return cpu.intersection_bev
 
 
-BEV_BACKENDS = (Backend("numba", _can_run_numba, _numba_bev), Backend("reference", always, lambda: reference.iou_bev))
-BOX_BACKENDS = (Backend("numba", _can_run_numba, _numba_3d), Backend("reference", always, lambda: reference.iou_3d))
+def _triton_bev() -> Callable[..., Tensor]:
+    from beambox.ops.rotated_iou import gpu
+
+    return gpu.iou_bev
+
+
+def _triton_3d() -> Callable[..., Tensor]:
+    from beambox.ops.rotated_iou import gpu
+
+    return gpu.iou_3d
+
+
+def _triton_area() -> Callable[..., Tensor]:
+    from beambox.ops.rotated_iou import gpu
+
+    return gpu.intersection_bev
+
+
+BEV_BACKENDS = (
+    Backend("triton", _can_run_triton, _triton_bev),
+    Backend("numba", _can_run_numba, _numba_bev),
+    Backend("reference", always, lambda: reference.iou_bev),
+)
+BOX_BACKENDS = (
+    Backend("triton", _can_run_triton, _triton_3d),
+    Backend("numba", _can_run_numba, _numba_3d),
+    Backend("reference", always, lambda: reference.iou_3d),
+)
 AREA_BACKENDS = (
+    Backend("triton", _can_run_triton, _triton_area),
     Backend("numba", _can_run_numba, _numba_area),
     Backend("reference", always, lambda: reference.intersection_bev),
 )
@@ -48,8 +80,8 @@ AREA_BACKENDS = (
 def iou_bev(a: Tensor, b: Tensor) -> Tensor:
     """Return the intersection over union of all pairs of boxes, seen from above.
 
-    Exact polygon clipping in float64. A box without area has IoU 0 with every box. Differentiable with respect to both
-    (by the reference version).
+    Exact polygon clipping in float64. A box without area, or with a value that is not finite, has IoU 0 with every box.
+    Differentiable with respect to both (by the reference version).
 
     Args:
         a: ``(N, 7)`` boxes x, y, z, l, w, h, yaw; metres and radians; a negative size counts as 0.

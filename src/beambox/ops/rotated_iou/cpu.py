@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from beambox.ops.jit import jit
+from beambox.ops.rotated_iou.prepared import prepare
 
-__all__ = ["intersection_bev", "iou_3d", "iou_bev", "prepare", "shared_area"]
+__all__ = ["intersection_bev", "iou_3d", "iou_bev", "shared_area"]
 
 AREA, IOU_BEV, IOU_3D = 0, 1, 2
 
@@ -28,18 +29,9 @@ def intersection_bev(a: Tensor, b: Tensor) -> Tensor:
     return _pairs(a, b, AREA)
 
 
-def prepare(boxes: Tensor) -> np.ndarray:
-    """Return one row a box: x, y, half length, half width, cosine, sine, radius, z, half height; ``(N, 9)`` float64."""
-    boxes = boxes.detach().double()
-    half = boxes[:, 3:6].clamp(min=0) / 2
-    x, y, z, yaw = boxes[:, 0], boxes[:, 1], boxes[:, 2], boxes[:, 6]
-    columns = (x, y, half[:, 0], half[:, 1], yaw.cos(), yaw.sin(), half[:, :2].norm(dim=1), z, half[:, 2])
-    return torch.stack(columns, dim=1).numpy()
-
-
 def _pairs(a: Tensor, b: Tensor, what: int) -> Tensor:
     dtype = torch.promote_types(a.dtype, b.dtype)
-    return torch.from_numpy(_fill(prepare(a), prepare(b), what)).to(dtype)
+    return torch.from_numpy(_fill(prepare(a).numpy(), prepare(b).numpy(), what)).to(dtype)
 
 
 @jit

@@ -41,7 +41,9 @@ def intersection_bev(a: Tensor, b: Tensor) -> Tensor:
     with torch.no_grad():  # boxes whose circumscribed circles do not meet share nothing
         reach_a, reach_b = (box[:, 3:5].clamp(min=0).norm(dim=1) / 2 for box in (a, b))
         gap = torch.cdist(a[:, :2], b[:, :2], compute_mode="donot_use_mm_for_euclid_dist")  # (N, M)
-        first, second = (gap <= reach_a[:, None] + reach_b).nonzero(as_tuple=True)  # (P,)
+        finite_a, finite_b = (box.isfinite().all(dim=1) for box in (a, b))
+        near = (gap <= reach_a[:, None] + reach_b) & finite_a[:, None] & finite_b
+        first, second = near.nonzero(as_tuple=True)  # (P,)
     blocks = zip(first.split(PAIRS_AT_ONCE), second.split(PAIRS_AT_ONCE))
     areas = torch.cat([paired_intersection_bev(a[i], b[j]) for i, j in blocks])  # (P,)
     return a.new_zeros(len(a), len(b)).index_put((first, second), areas).to(dtype)

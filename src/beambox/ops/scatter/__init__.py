@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
 from beambox.ops.scatter import reference
 
 __all__ = ["scatter_bev", "segment_max", "segment_mean", "segment_sum"]
@@ -20,7 +20,34 @@ def _numba_max() -> Callable[..., Tensor]:
     return cpu.segment_max
 
 
+def _triton_max() -> Callable[..., Tensor]:
+    from beambox.ops.scatter import gpu
+
+    return gpu.segment_max
+
+
+def _triton_sum() -> Callable[..., Tensor]:
+    from beambox.ops.scatter import gpu
+
+    return gpu.segment_sum
+
+
+def _triton_mean() -> Callable[..., Tensor]:
+    from beambox.ops.scatter import gpu
+
+    return gpu.segment_mean
+
+
+SUM_BACKENDS = (
+    Backend("triton", can_run_triton, _triton_sum),
+    Backend("reference", always, lambda: reference.segment_sum),
+)
+MEAN_BACKENDS = (
+    Backend("triton", can_run_triton, _triton_mean),
+    Backend("reference", always, lambda: reference.segment_mean),
+)
 MAX_BACKENDS = (
+    Backend("triton", can_run_triton, _triton_max),
     Backend("numba", can_run_numba, _numba_max),
     Backend("reference", always, lambda: reference.segment_max),
 )
@@ -41,13 +68,13 @@ def segment_sum(values: Tensor, segment: Tensor, size: int) -> Tensor:
         BeamboxError: if a shape or type does not fit, or a segment is out of range.
     """
     _check(values, segment, size)
-    return reference.segment_sum(values, segment, size)
+    return choose("segment_sum", SUM_BACKENDS, values, segment)(values, segment, size)
 
 
 def segment_mean(values: Tensor, segment: Tensor, size: int) -> Tensor:
     """Average the rows of each segment; arguments and errors as in :func:`segment_sum`."""
     _check(values, segment, size)
-    return reference.segment_mean(values, segment, size)
+    return choose("segment_mean", MEAN_BACKENDS, values, segment)(values, segment, size)
 
 
 def segment_max(values: Tensor, segment: Tensor, size: int) -> Tensor:
