@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from beambox.data.loader import MixedSource
 from beambox.data.source import FrameList
 from beambox.detectors.catalogue import build
 from beambox.structures import Frame, Labels
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.devices import make_fabric
-from beambox.train.feed import Draws, Feed
+from beambox.train.feed import Feed
 from beambox.train.loop import Run
 
 OPTIONS: dict[str, Any] = {
@@ -56,7 +57,7 @@ def recipe(**optim: Any) -> Recipe:
     )
 
 
-def shuffled(frame: Frame, rng: np.random.Generator) -> Frame:
+def shuffled(frame: Frame, rng: np.random.Generator, position: int) -> Frame:
     """Augment: the points in another order, mirrored in half of the cases."""
     points = frame.points[rng.permutation(len(frame))]
     assert frame.labels is not None
@@ -75,18 +76,16 @@ def tiny_run(
     torch.manual_seed(made.seed)
     detector = build(made.detector.name, made.detector.options)
     fabric = make_fabric(made.precision)
-    source = frames(count)
-    draws = Draws((len(source),), None, made.seed)
     config = detector.config
     feed = Feed(
-        [source],
-        draws,
+        MixedSource([frames(count)]),
         shuffled,
         config.classes,
         config.grid,
         made.optim.batch,
         window,
-        fabric.global_rank,
-        fabric.world_size,
+        seed=made.seed,
+        rank=fabric.global_rank,
+        world=fabric.world_size,
     )
     return Run(made, detector, feed, fabric, folder)

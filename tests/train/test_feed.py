@@ -10,34 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beambox.checks import BeamboxError
+from beambox.data.loader import MixedSource
 from beambox.geometry.grid import VoxelGrid
 from beambox.structures import Labels
-from beambox.train.feed import Draws, choose_window, stream
+from beambox.train.feed import choose_window, stream
 from oracles.tiny_training import frames, tiny_run
 
 GRID = VoxelGrid((0.0, -12.8, -3.0), (25.6, 12.8, 1.0), (0.16, 0.16, 4.0))
-
-
-def test_without_weights_an_epoch_shows_every_frame_once() -> None:
-    draws = Draws((5, 3), None, seed=1)
-    for epoch in range(3):
-        rows = {tuple(row) for row in draws.epoch(epoch).tolist()}
-        assert rows == {(0, i) for i in range(5)} | {(1, i) for i in range(3)}
-    assert not np.array_equal(draws.epoch(0), draws.epoch(1))
-
-
-def test_weights_set_shares_and_no_frame_comes_twice_before_all_came() -> None:
-    draws = Draws((10, 30), (3.0, 1.0), seed=1)
-    seen = np.concatenate([draws.epoch(epoch) for epoch in range(3)])
-    assert np.bincount(seen[:, 0]).tolist() == [90, 30]
-    assert np.bincount(seen[seen[:, 0] == 0, 1]).tolist() == [9] * 10
-    assert np.bincount(seen[seen[:, 0] == 1, 1]).tolist() == [1] * 30
-
-
-def test_empty_source_is_refused() -> None:
-    with pytest.raises(BeamboxError, match="must have some"):
-        Draws((3, 0), None, 0)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 20), st.integers(1, 20))
@@ -87,8 +66,7 @@ def test_a_frame_without_objects_is_replaced(tmp_path: Path) -> None:
     source = frames(3)
     empty = source.frames[1].__class__(source.frames[1].points, "empty", Labels.empty())
     source.frames[1] = empty  # pyright: ignore
-    feed.sources = [source]
-    feed.draws = Draws((3,), None, 0)
+    feed.source = MixedSource([source])
     names = {feed.frame(position).id for position in range(9)}
     assert "empty" not in names
 

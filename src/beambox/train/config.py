@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.data.augment import AugmentConfig
 
 __all__ = [
     "AugmentSection",
@@ -23,9 +24,6 @@ __all__ = [
     "parse_recipe",
     "read_recipe",
 ]
-
-Positive = Field(gt=0)
-Share = Field(ge=0, le=1)
 
 
 class Section(BaseModel):
@@ -56,7 +54,7 @@ class DetectorSection(Section):
 class SourceSection(Section):
     """One set of frames."""
 
-    kind: Literal["kitti", "once", "custom", "simulated"]
+    kind: Literal["kitti", "simulated"]
     """Layout of the files; ``simulated`` makes sweeps on the fly and needs no files."""
     path: str = "{data}"
     """Folder; ``{data}`` stands for what ``--data`` gives."""
@@ -79,27 +77,15 @@ class SourceSection(Section):
     """Simulated: seed of the scenes."""
 
 
-class AugmentSection(Section):
-    """Random changes to training frames, applied in this order; the defaults change nothing."""
+class AugmentSection(AugmentConfig):
+    """Random changes to training frames: the fields of ``beambox.data.augment.AugmentConfig``, and the database."""
 
-    sample_objects: dict[str, int] = {}
-    """Objects of each class pasted into a frame from the database of cut-out objects."""
-    sample_to_total: bool = False
-    """Count the objects already in the frame against ``sample_objects``."""
-    object_min_points: int = Field(default=5, ge=0)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    sample: dict[str, Annotated[int, Field(ge=0)]] = Field(default_factory=dict)
+    """Objects drawn from the database a frame, by class, in the order of drawing."""
+    object_min_points: int = Field(default=5, ge=1)
     """Objects with fewer LiDAR points do not enter the database."""
-    object_rotation: float = Field(default=0.0, ge=0)
-    """Each object is turned by up to this angle about its own axis, radians; 0 for none."""
-    object_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Standard deviation of each object's displacement along x, y, z, metres."""
-    flip_y: float = Field(default=0.0, ge=0, le=1)
-    """Probability of mirroring left and right (y to -y)."""
-    flip_x: float = Field(default=0.0, ge=0, le=1)
-    """Probability of mirroring front and back (x to -x); for sweeps of 360 degrees."""
-    rotation: float = Field(default=0.0, ge=0)
-    """The scene is turned about z by up to this angle to either side, radians."""
-    scale: tuple[float, float] = (1.0, 1.0)
-    """The scene is scaled by a factor between these two."""
 
 
 class OptimSection(Section):
@@ -166,8 +152,8 @@ class Recipe(Section):
     """The network."""
     data: tuple[SourceSection, ...] = Field(min_length=1)
     """Where training frames come from."""
-    augment: AugmentSection = AugmentSection()
-    """Random changes to training frames."""
+    augment: AugmentSection | None = None
+    """Random changes to training frames; null for none but the order of points."""
     optim: OptimSection
     """Optimiser and length of the run."""
     validation: ValidationSection | None = None
@@ -241,7 +227,12 @@ def parse_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
             place = ".".join(str(part) for part in fault["loc"])
             text = fault["msg"].removeprefix("Value error, ")
             text = text[:1].lower() + text[1:] if fault["type"] != "value_error" else text
-            got = "" if fault["type"] in {"value_error", "missing"} else f", got {fault['input']!r}"
+            if fault["type"] == "extra_forbidden":  # in the section that comes from beambox.data
+                *_, key = fault["loc"]
+                place = place.rpartition(".")[0]
+                text = f'unknown key "{key}"{did_you_mean(str(key), AugmentSection.model_fields)}'
+            plain = {"value_error", "missing", "extra_forbidden"}
+            got = "" if fault["type"] in plain else f", got {fault['input']!r}"
             faults.append(f"{place + ': ' if place else ''}{text}{got}")
         raise BeamboxError(f"{where}: " + "; ".join(faults)) from None
 

@@ -4,67 +4,21 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from beambox.checks import BeamboxError
-from beambox.data.source import FrameSource
+from beambox.data.loader import MixedSource
 from beambox.geometry.grid import VoxelGrid
 from beambox.structures import Batch, Frame, Labels
 
-__all__ = ["Draws", "Feed", "TrainingBatch", "choose_window", "stream"]
+__all__ = ["Feed", "TrainingBatch", "choose_window", "stream"]
 
-# what a random stream is for; keeps the streams of one seed apart
-ORDER, CHANGES, WINDOW = 1, 2, 3
+# what a random stream is for; keeps the streams of one seed apart, and apart from those of beambox.data.loader
+CHANGES, WINDOW = 11, 12
 ATTEMPTS = 8
-
-
-@dataclass(frozen=True)
-class Draws:
-    """The order in which frames are drawn from several sources.
-
-    Without weights an epoch shows every frame once. With weights it is as long but source s has the share
-    weights[s] / sum of it, and goes through all of its frames before any comes again.
-    """
-
-    sizes: tuple[int, ...]
-    """Number of frames of each source."""
-    weights: tuple[float, ...] | None
-    """Relative share of each source."""
-    seed: int
-
-    def __post_init__(self) -> None:
-        if not self.sizes or min(self.sizes) <= 0:
-            raise BeamboxError(f"every source of training frames must have some; got sizes {list(self.sizes)}")
-
-    @property
-    def epoch_size(self) -> int:
-        """Number of frames drawn in an epoch."""
-        return sum(self.sizes)
-
-    def epoch(self, number: int) -> np.ndarray:
-        """Return ``(epoch_size, 2)`` int64: source and frame of each draw of an epoch."""
-        shares = self.sizes if self.weights is None else self.weights
-        ends = np.round(np.cumsum(shares) / np.sum(shares) * self.epoch_size).astype(np.int64)
-        quotas = np.diff(ends, prepend=0)
-        drawn = [
-            np.stack((np.full(quota, source), self._walk(source, number * int(quota), int(quota))), axis=1)
-            for source, quota in enumerate(quotas)
-        ]
-        rows = np.concatenate(drawn)
-        return rows[np.random.default_rng((self.seed, ORDER, number)).permutation(len(rows))]
-
-    def _walk(self, source: int, first: int, count: int) -> np.ndarray:
-        """Frames first to first + count of an endless walk through a source, shuffled anew on each pass."""
-        size = self.sizes[source]
-        passes = range(first // size, (first + count - 1) // size + 1) if count else range(0)
-        orders = [np.random.default_rng((self.seed, ORDER, n, source)).permutation(size) for n in passes]
-        walk = np.concatenate(orders) if orders else np.zeros(0, dtype=np.int64)
-        start = first - passes.start * size
-        return walk[start : start + count]
 
 
 class TrainingBatch:
@@ -111,23 +65,38 @@ class Feed(Dataset[TrainingBatch]):
 
     def __init__(
         self,
-        sources: Sequence[FrameSource],
-        draws: Draws,
-        change: Callable[[Frame, np.random.Generator], Frame],
+        source: MixedSource,
+        change: Callable[[Frame, np.random.Generator, int], Frame],
         classes: Sequence[str],
         grid: VoxelGrid,
         batch: int,
         window: tuple[int, int] | None = None,
+        *,
+        seed: int = 0,
         rank: int = 0,
         world: int = 1,
     ) -> None:
-        """Args: see the fields of a recipe; ``change`` augments a frame, ``batch`` counts all ``world`` processes."""
+        """Set up.
+
+        Args:
+            source: training frames.
+            change: augments a frame, given a generator and the frame's position in the run.
+            classes: of the detector.
+            grid: of the detector.
+            batch: frames in a step, all processes together.
+            window: cells (x, y) to look at; None for all.
+            seed: of the order, the changes and the windows.
+            rank: of this process.
+            world: number of processes.
+        """
         if batch % world:
             raise BeamboxError(f"optim.batch = {batch} frames cannot be shared evenly by {world} processes")
-        self.sources, self.draws, self.change = list(sources), draws, change
+        if len(source) == 0:
+            raise BeamboxError("there are no training frames")
+        self.source, self.change = source, change
         self.classes, self.grid, self.window = tuple(classes), grid, window
-        self.batch, self.rank, self.world = batch, rank, world
-        self._epoch: tuple[int, np.ndarray] = (-1, np.zeros((0, 2), dtype=np.int64))
+        self.batch, self.seed, self.rank, self.world = batch, seed, rank, world
+        self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, dtype=np.int64))
 
     def __getitem__(self, step: int) -> TrainingBatch:
         """Return this process's share of the batch of a step."""
@@ -138,7 +107,7 @@ class Feed(Dataset[TrainingBatch]):
         assert batch.labels is not None
         if self.window is None:
             return TrainingBatch(batch, None)
-        rng = np.random.default_rng((self.draws.seed, WINDOW, step, self.rank))
+        rng = np.random.default_rng((self.seed, WINDOW, step, self.rank))
         grid = choose_window(batch.labels, self.classes, self.grid, self.window, rng)
         frames = [crop(frame, grid) for frame in frames]
         return TrainingBatch(Batch.of(frames), grid)
@@ -146,26 +115,20 @@ class Feed(Dataset[TrainingBatch]):
     def frame(self, position: int) -> Frame:
         """Return the frame at a position of the run, augmented; one left without objects is replaced by another."""
         for attempt in range(ATTEMPTS):
-            rng = np.random.default_rng((self.draws.seed, CHANGES, position, attempt))
-            source, index = self._draw(position) if attempt == 0 else self._any(rng)
-            frame = self.change(self.sources[source][index], rng)
+            rng = np.random.default_rng((self.seed, CHANGES, position, attempt))
+            index = self._draw(position) if attempt == 0 else int(rng.integers(len(self.source)))
+            frame = self.change(self.source[index], rng, position)
             if frame.labels is None:
                 raise BeamboxError(f"frame {frame.id} has no labels, training needs them")
-            labels = frame.labels.of_classes(self.classes)
-            if bool(self.grid.contains(labels.boxes).any()):
+            if bool(self.grid.contains(frame.labels.of_classes(self.classes).boxes).any()):
                 break
         return frame
 
-    def _draw(self, position: int) -> tuple[int, int]:
-        number, place = divmod(position, self.draws.epoch_size)
-        if self._epoch[0] != number:
-            self._epoch = (number, self.draws.epoch(number))
-        source, index = self._epoch[1][place]
-        return int(source), int(index)
-
-    def _any(self, rng: np.random.Generator) -> tuple[int, int]:
-        source = int(rng.integers(len(self.sources)))
-        return source, int(rng.integers(len(self.sources[source])))
+    def _draw(self, position: int) -> int:
+        epoch, place = divmod(position, len(self.source))
+        if self._order[0] != epoch:
+            self._order = (epoch, self.source.order(self.seed, epoch))
+        return int(self._order[1][place])
 
 
 def crop(frame: Frame, grid: VoxelGrid) -> Frame:

@@ -17,6 +17,8 @@ from torch import Tensor, nn
 
 from beambox import __version__
 from beambox.checks import BeamboxError
+from beambox.data.database import ObjectDatabase
+from beambox.data.loader import MixedSource
 from beambox.detectors.catalogue import build, config_to_dict, name_of
 from beambox.detectors.weights import fill, read_weights, save_weights
 from beambox.train.checkpoint import (
@@ -29,10 +31,10 @@ from beambox.train.checkpoint import (
 )
 from beambox.train.config import Recipe
 from beambox.train.devices import make_fabric
-from beambox.train.feed import Draws, Feed, TrainingBatch, stream
+from beambox.train.feed import Feed, TrainingBatch, stream
 from beambox.train.log import Clock, RunLog, duration
 from beambox.train.optim import Ema, adam, apply_schedule
-from beambox.train.sources import make_change, open_source
+from beambox.train.sources import Change, open_database, open_source
 from beambox.train.validate import Score, Validator
 
 if TYPE_CHECKING:
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Outcome", "Run", "train"]
 
-LAST, BEST, FINAL = "last.safetensors", "best.safetensors", "final.safetensors"
+LAST, BEST, FINAL, OBJECTS = "last.safetensors", "best.safetensors", "final.safetensors", "objects.npz"
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class Run:
     def __init__(self, recipe: Recipe, detector: nn.Module, feed: Feed, fabric: Fabric, folder: Path) -> None:
         self.recipe, self.detector, self.feed, self.fabric, self.folder = recipe, detector, feed, fabric, folder
         optim = recipe.optim
-        per_epoch = feed.draws.epoch_size / optim.batch
+        per_epoch = len(feed.source) / optim.batch
         self.total = optim.iterations or max(1, round((optim.epochs or 0) * per_epoch))
         self.per_epoch = per_epoch
         self.step = 0
@@ -266,7 +268,7 @@ def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) ->
     if recipe.threads:
         torch.set_num_threads(recipe.threads)
     fabric = make_fabric(recipe.precision)
-    run = assemble(recipe, data, out, fabric)
+    run = assemble(recipe, data, out, fabric, reuse=resume)
     if resume:
         run.restore()
     log = RunLog(out, run.total, run.step, active=fabric.global_rank == 0)
@@ -287,8 +289,16 @@ def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) ->
         log.close()
 
 
-def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric) -> Run:
-    """Build the detector, the stream of batches and the validation that a recipe asks for."""
+def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, reuse: bool = False) -> Run:
+    """Build the detector, the stream of batches and the validation that a recipe asks for.
+
+    Args:
+        recipe: what to do.
+        data: folder that ``{data}`` stands for.
+        out: folder of the run.
+        fabric: devices and processes.
+        reuse: take the object database that lies in the folder already.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         detector = build(recipe.detector.name, recipe.detector.options)
@@ -299,18 +309,22 @@ def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric) -> Ru
     config = detector.config
     sources = [open_source(section, data) for section in recipe.data]
     weights = tuple(section.weight for section in recipe.data if section.weight is not None)
-    draws = Draws(tuple(len(source) for source in sources), weights or None, recipe.seed)
-    change = make_change(recipe, sources, out if fabric.global_rank == 0 else None)
+    database = None
+    if recipe.augment and recipe.augment.sample:
+        if fabric.global_rank == 0:
+            open_database(recipe, data, out / OBJECTS, reuse, lambda text: print(text, flush=True))
+        fabric.barrier()
+        database = ObjectDatabase.load(out / OBJECTS)
     feed = Feed(
-        sources,
-        draws,
-        change,
+        MixedSource(sources, weights or None),
+        Change(recipe.augment, database, recipe.seed),
         config.classes,
         config.grid,
         recipe.optim.batch,
         recipe.window,
-        fabric.global_rank,
-        fabric.world_size,
+        seed=recipe.seed,
+        rank=fabric.global_rank,
+        world=fabric.world_size,
     )
     run = Run(recipe, detector, feed, fabric, out)
     if recipe.validation:
@@ -326,7 +340,7 @@ def introduce(run: Run, log: RunLog, resumed: bool) -> None:
     precision = type(fabric.strategy.precision).__name__
     log.say(
         f"{fabric.world_size} x {fabric.device.type}, {precision}, {torch.get_num_threads()} threads; "
-        f"{run.feed.draws.epoch_size} frames an epoch, {run.per_epoch:.0f} steps an epoch, {run.total} steps"
+        f"{len(run.feed.source)} frames an epoch, {run.per_epoch:.0f} steps an epoch, {run.total} steps"
     )
     if resumed:
         log.say(f"going on after step {run.step}")

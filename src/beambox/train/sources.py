@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from beambox.checks import BeamboxError
+from beambox.data.augment import augment, shuffle_points
+from beambox.data.database import ObjectDatabase
 from beambox.data.kitti import KittiSource
 from beambox.data.source import FrameSource, SubsetSource
 from beambox.structures import Frame
-from beambox.train.config import Recipe, SourceSection
+from beambox.train.config import AugmentSection, Recipe, SourceSection
 
-__all__ = ["make_change", "open_source"]
+__all__ = ["Change", "open_database", "open_source"]
 
 
 def open_source(section: SourceSection, data: Path | None) -> FrameSource:
@@ -45,18 +47,63 @@ def open_kitti(section: SourceSection, data: Path | None) -> FrameSource:
     return KittiSource(folder_of(section, data), section.split, fov=section.camera_view)
 
 
+def open_simulated(section: SourceSection, data: Path | None) -> FrameSource:
+    """Make sweeps on the fly; slow for training on, handy for trying a recipe without any data."""
+    from beambox.simulate import SimulatedSource
+
+    if section.frames is None:
+        raise BeamboxError("a simulated source has no end: say how many `frames` it has")
+    return SimulatedSource(
+        section.frames,
+        section.seed,
+        section.sensor,
+        "camera" if section.camera_view else "full",
+        section.layout.replace("{data}", str(data)),
+    )
+
+
 OPENERS: dict[str, Callable[[SourceSection, Path | None], FrameSource]] = {
     "kitti": open_kitti,
+    "simulated": open_simulated,
 }
 
 
-def make_change(
-    recipe: Recipe, sources: Sequence[FrameSource], folder: Path | None
-) -> Callable[[Frame, np.random.Generator], Frame]:
-    """Return the function that augments a training frame, as the recipe says."""
-    return unchanged
+def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, say: Callable[[str], None]) -> None:
+    """Cut the objects for sampling out of the recipe's sources into ``file``.
+
+    Args:
+        recipe: with ``augment.sample``.
+        data: folder that ``{data}`` stands for.
+        file: where the database goes.
+        reuse: take a file that is there already, as when a run is resumed.
+        say: told what happens.
+    """
+    assert recipe.augment is not None
+    if reuse and file.exists():
+        return
+    parts = []
+    for section in recipe.data:
+        if not section.objects:
+            continue
+        # whole sweeps: an object cut by the image's border is complete in the LiDAR's view
+        source = open_source(section.model_copy(update={"camera_view": False}), data)
+        say(f"cutting objects out of the {len(source)} frames of {section.path} {section.split}")
+        parts.append(ObjectDatabase.build(source, tuple(recipe.augment.sample), recipe.augment.object_min_points))
+    if not parts:
+        raise BeamboxError("augment.sample needs objects: let at least one source of `data` have `objects: true`")
+    database = ObjectDatabase.joined(parts)
+    say(f"object database: {', '.join(f'{count} {name}' for name, count in database.counts().items())}")
+    database.save(file)
 
 
-def unchanged(frame: Frame, rng: np.random.Generator) -> Frame:
-    """Return the frame with its points in random order, so that full voxels keep a random choice of theirs."""
-    return frame.with_points(frame.points[rng.permutation(len(frame))])
+class Change:
+    """Augments the frame at a position of the run; a pure function of frame, position and random generator."""
+
+    def __init__(self, section: AugmentSection | None, database: ObjectDatabase | None, seed: int) -> None:
+        self.section, self.database, self.seed = section, database, seed
+
+    def __call__(self, frame: Frame, rng: np.random.Generator, position: int) -> Frame:
+        """Return the augmented frame."""
+        if self.section is None:
+            return shuffle_points(frame, rng)
+        return augment(frame, rng, self.section, self.database, position, self.seed)
