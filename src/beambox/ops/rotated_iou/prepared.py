@@ -18,4 +18,4 @@ def prepare(boxes: Tensor) -> Tensor:
     x, y, z, yaw = boxes[:, 0], boxes[:, 1], boxes[:, 2], boxes[:, 6]
     columns = (x, y, half[:, 0], half[:, 1], yaw.cos(), yaw.sin(), half[:, :2].norm(dim=1), z, half[:, 2])
     rows = torch.stack(columns, dim=1)
-    return torch.where(rows.isfinite().all(dim=1, keepdim=True), rows, 0.0)
+    return torch.where(boxes.isfinite().all(dim=1, keepdim=True), rows, 0.0)
