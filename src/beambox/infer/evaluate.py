@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from beambox.checks import BeamboxError, MissingFileError
+from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
-from beambox.detectors.weights import load_weights
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
 from beambox.structures import Batch, Detections, Frame
 
-__all__ = ["detect_frames", "detector_for", "parse_overlaps", "score_frames", "scored_frames", "write_results"]
+__all__ = ["detect_frames", "network", "parse_overlaps", "score_frames", "scored_frames", "write_results"]
 
-Progress = Callable[[int], None]
+Detect = Callable[[Sequence[Frame]], list[Detections]]
+"""Frames to their detections, best first, on the CPU; ``Detector.detect`` is one, :func:`network` makes one."""
 
 
-def detector_for(name: str, device: str = "auto") -> Any:
-    """Load a bare detector (three calls, no reading of files) from a weight file, the folder of a run, or by name.
+def network(model: Any) -> Detect:
+    """Detect with a bare network as it stands, in training say: its mode is restored after each call."""
 
-    Args:
-        name: path of a weight file, or folder of a run, whose best weights are taken, else its final ones.
-        device: ``auto``, ``cpu`` or ``cuda``.
-    """
-    path = Path(name)
-    if path.is_dir():
-        held = [path / file for file in ("best.safetensors", "final.safetensors") if (path / file).is_file()]
-        if not held:
-            raise MissingFileError(
-                f"{path} holds no weights: expected best.safetensors or final.safetensors, which `beambox train` "
-                "writes at its first validation and at its end"
-            )
-        path = held[0]
-    chosen = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
-    return load_weights(path, chosen)
+    @torch.inference_mode()
+    def detect(frames: Sequence[Frame]) -> list[Detections]:
+        device = next(iter(model.parameters())).device
+        was_training = model.training
+        model.eval()
+        try:
+            found = model.decode(model(Batch.of(frames).to(device)))
+        finally:
+            model.train(was_training)
+        return [replace(one.to("cpu"), frame_id=frame.id) for frame, one in zip(frames, found)]
+
+    return detect
 
 
 def parse_overlaps(texts: Sequence[str]) -> dict[str, float]:
@@ -57,14 +54,13 @@ def parse_overlaps(texts: Sequence[str]) -> dict[str, float]:
     return overlaps
 
 
-@torch.inference_mode()
 def detect_frames(
-    model: Any, source: FrameSource, *, batch: int = 1, score_threshold: float = 0.0
+    detect: Detect, source: FrameSource, *, batch: int = 1, score_threshold: float = 0.0
 ) -> Iterator[tuple[Frame, Detections]]:
     """Detect in every frame of a source, in order.
 
     Args:
-        model: a detector; its training mode is restored in the end.
+        detect: what detects.
         source: frames.
         batch: frames in one pass; more than one pays on a GPU.
         score_threshold: drop lower scores, beyond what the model's own post-processing drops.
@@ -72,48 +68,23 @@ def detect_frames(
     Yields:
         Each frame with its detections, best first, on the CPU.
     """
-    device = next(iter(model.parameters())).device
-    was_training = model.training
-    model.eval()
-    try:
-        for start in range(0, len(source), batch):
-            frames = [source[i] for i in range(start, min(start + batch, len(source)))]
-            found = model.decode(model(Batch.of(frames).to(device)))
-            for frame, one in zip(frames, found):
-                kept = one.to("cpu")
-                yield frame, replace(kept[kept.scores >= score_threshold], frame_id=frame.id)
-    finally:
-        model.train(was_training)
+    for start in range(0, len(source), batch):
+        frames = [source[i] for i in range(start, min(start + batch, len(source)))]
+        for frame, found in zip(frames, detect(frames)):
+            yield frame, found[found.scores >= score_threshold]
 
 
-def scored_frames(
-    model: Any,
-    source: FrameSource,
-    *,
-    batch: int = 1,
-    score_threshold: float = 0.0,
-    progress: Progress | None = None,
-) -> list[KittiFrame]:
-    """Detect in a labelled source and keep what scoring needs: no points.
-
-    Args:
-        model: a detector.
-        source: frames with labels.
-        batch: frames in one pass.
-        score_threshold: as for :func:`detect_frames`.
-        progress: told the number of frames done, after each.
+def scored_frames(found: Iterable[tuple[Frame, Detections]]) -> list[KittiFrame]:
+    """Keep of frames and their detections what scoring needs: no points.
 
     Raises:
         BeamboxError: if a frame has no labels.
     """
     kept = []
-    for frame, found in detect_frames(model, source, batch=batch, score_threshold=score_threshold):
+    for frame, detections in found:
         if frame.labels is None:
             raise BeamboxError(f"frame {frame.id} has no labels, so detections cannot be scored; use `beambox detect`")
-        size = frame.image_size or (1242, 375)
-        kept.append(KittiFrame(frame.labels, found, frame.calibration, size))
-        if progress is not None:
-            progress(len(kept))
+        kept.append(KittiFrame(frame.labels, detections, frame.calibration, frame.image_size or (1242, 375)))
     return kept
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import platform
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
 from beambox.checks import BeamboxError
+from beambox.infer.precision import bfloat16_reason
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -33,21 +32,7 @@ def choose_precision(wanted: str, device: str) -> str:
         raise BeamboxError("precision float16 needs a GPU; on a CPU take auto, bfloat16 or float32")
     if wanted != "auto":
         return wanted
-    if device == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
-    return "bfloat16" if cpu_has_fast_bfloat16() else "float32"
-
-
-def cpu_has_fast_bfloat16(cpuinfo: Path = Path("/proc/cpuinfo")) -> bool:
-    """Tell whether the CPU multiplies bfloat16 in hardware (AMX or AVX512-BF16); False where that is not known."""
-    if platform.machine().lower() not in ("x86_64", "amd64"):
-        return False
-    try:
-        lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return False
-    flags = next((set(line.split(":", 1)[1].split()) for line in lines if line.startswith("flags")), set())
-    return bool(flags & {"amx_bf16", "avx512_bf16"})
+    return "float32" if bfloat16_reason(torch.device(device)) else "bfloat16"
 
 
 def make_fabric(precision: str) -> Fabric:

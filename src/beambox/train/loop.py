@@ -149,11 +149,11 @@ class Run:
         plain = self.recipe.model_dump(mode="json")
         Checkpoint(tensors, self.step, plain, self.identity(), state).save(self.folder / LAST)
 
-    def restore(self) -> None:
-        """Go back to the state of ``last.safetensors``.
+    def restore(self) -> list[str]:
+        """Go back to the state of ``last.safetensors``; returns the parts of the recipe that have changed since.
 
         Raises:
-            BeamboxError: if it is of another detector, or of a run of another length.
+            BeamboxError: if there is none, or it is of another detector.
         """
         path = self.folder / LAST
         saved = load_checkpoint(path)
@@ -168,6 +168,8 @@ class Run:
         if saved.state["precision"]:
             self.fabric.strategy.precision.load_state_dict(saved.state["precision"])
         self.step, self.best = saved.step, saved.state["best"]
+        now = self.recipe.model_dump(mode="json")
+        return [key for key in now if now[key] != saved.recipe.get(key)]
 
     def export(self, name: str, scores: Mapping[str, Any]) -> Path:
         """Write the weights a user loads, with a card of where they come from."""
@@ -269,11 +271,14 @@ def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) ->
         torch.set_num_threads(recipe.threads)
     fabric = make_fabric(recipe.precision)
     run = assemble(recipe, data, out, fabric, reuse=resume)
-    if resume:
-        run.restore()
+    changed = run.restore() if resume else []
     log = RunLog(out, run.total, run.step, active=fabric.global_rank == 0)
     try:
-        introduce(run, log, resume)
+        introduce(run, log)
+        if resume:
+            log.say(f"going on after step {run.step}")
+        if changed:
+            log.say(f"note: the recipe has changed since, so the run is not the one it would have been: {changed}")
         finished = run.loop(log)
         run.save()
         if finished:
@@ -332,7 +337,7 @@ def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, reuse
     return run
 
 
-def introduce(run: Run, log: RunLog, resumed: bool) -> None:
+def introduce(run: Run, log: RunLog) -> None:
     """Say what is about to happen."""
     recipe, fabric = run.recipe, run.fabric
     count = sum(parameter.numel() for parameter in run.detector.parameters())
@@ -342,5 +347,3 @@ def introduce(run: Run, log: RunLog, resumed: bool) -> None:
         f"{fabric.world_size} x {fabric.device.type}, {precision}, {torch.get_num_threads()} threads; "
         f"{len(run.feed.source)} frames an epoch, {run.per_epoch:.0f} steps an epoch, {run.total} steps"
     )
-    if resumed:
-        log.say(f"going on after step {run.step}")

@@ -8,7 +8,7 @@ from typing import Any
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.source import FrameSource
-from beambox.infer.evaluate import score_frames, scored_frames
+from beambox.infer.evaluate import detect_frames, network, score_frames, scored_frames
 from beambox.metrics.kitti_result import KittiResult
 from beambox.train.config import ValidationSection
 
@@ -43,7 +43,7 @@ class Validator:
                 f'validation.choose_by: the detector has no class "{self.section.choose_by}"'
                 f"{did_you_mean(self.section.choose_by, [*classes, 'mean'])}"
             )
-        frames = scored_frames(model, self.source)
+        frames = scored_frames(detect_frames(network(model), self.source))
         return summarise(score_frames(frames, classes, self.section.iou or None), self.section)
 
 

@@ -1,0 +1,38 @@
+"""The choice of precision."""
+
+from __future__ import annotations
+
+import builtins
+from typing import Any
+
+import pytest
+
+from beambox.checks import BeamboxError
+from beambox.infer.precision import bfloat16_reason
+from beambox.train.devices import choose_precision, make_fabric
+
+
+def test_auto_takes_bfloat16_only_where_it_is_native() -> None:
+    import torch
+
+    reason = bfloat16_reason(torch.device("cpu"))
+    assert choose_precision("auto", "cpu") == ("float32" if reason else "bfloat16")
+    assert choose_precision("bfloat16", "cpu") == "bfloat16"
+
+
+def test_half_precision_on_a_cpu_is_refused() -> None:
+    with pytest.raises(BeamboxError, match="float16 needs a GPU"):
+        choose_precision("float16", "cpu")
+
+
+def test_missing_fabric_is_said_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.startswith("lightning_fabric"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(BeamboxError, match=r"pip install 'beambox\[train\]'"):
+        make_fabric("auto")
