@@ -25,7 +25,9 @@ def checkpoint_of(model: str, classes: int) -> tuple[nn.Module, dict[str, Tensor
     state = {}
     for name, value in detector.state_dict().items():
         layer, _, leaf = name.rpartition(".")
-        state[f"{layers[layer]}.{leaf}"] = value.permute(4, 0, 1, 2, 3) if value.dim() == 5 else value
+        kernel = (3, 3, 3) if value.dim() == 3 and len(value) == 27 else (3, 1, 1)
+        sparse = value.dim() == 3
+        state[f"{layers[layer]}.{leaf}"] = value.unflatten(0, kernel).permute(4, 0, 1, 2, 3) if sparse else value
     return detector, state
 
 

@@ -68,7 +68,7 @@ def test_encoder_equals_dense_convolutions_where_everything_is_active():
 
     def dense(block, value):
         geometry, norm = block.conv.geometry, block.norm
-        value = F.conv3d(value, dense_weight(block.conv.weight), None, geometry.stride, geometry.padding)
+        value = F.conv3d(value, dense_weight(block.conv.kernel()), None, geometry.stride, geometry.padding)
         return F.relu(F.batch_norm(value, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps))
 
     value = x.to_dense()

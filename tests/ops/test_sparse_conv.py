@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import pytest
 import torch
 import torch.nn.functional as F
@@ -245,18 +244,15 @@ def many_threads_agree(repetitions: int) -> None:
         grads = torch.autograd.grad((out.features**2).sum(), leaves)
         return [out.features.detach(), out.indices, *grads]
 
-    before = torch.get_num_threads(), numba.get_num_threads()
+    before = torch.get_num_threads()
     try:
         first = run()
         for repetition in range(repetitions):
-            threads = (1, 2, 4)[repetition % 3]
-            torch.set_num_threads(threads)
-            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+            torch.set_num_threads((1, 2, 4)[repetition % 3])
             for expected, found in zip(first, run()):
                 assert expected.equal(found)
     finally:
-        torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
+        torch.set_num_threads(before)
 
 
 def test_bits_do_not_depend_on_threads():

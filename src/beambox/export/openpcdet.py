@@ -199,13 +199,16 @@ def _fill(detector: nn.Module, state: Mapping[str, Tensor], layers: Mapping[str,
 def _laid_out(tensor: Tensor, shape: torch.Size) -> Tensor | None:
     """Bring a tensor into the layout of a parameter here, or return None where it does not fit.
 
-    Sparse kernels there are (C_out, kz, ky, kx, C_in) since spconv 2 and (kz, ky, kx, C_in, C_out), as here, before;
+    Sparse kernels there are (C_out, kz, ky, kx, C_in) since spconv 2 and
+    (kz, ky, kx, C_in, C_out) before; here they are (K, C_in, C_out)
     1 x 1 convolutions over points stand here as linear layers.
     """
     if tensor.shape == shape:
         return tensor
-    if tensor.dim() == 5 and tensor.permute(1, 2, 3, 4, 0).shape == shape:
-        return tensor.permute(1, 2, 3, 4, 0).contiguous()
+    if tensor.dim() == 5:
+        for kernel in (tensor.permute(1, 2, 3, 4, 0), tensor):
+            if kernel.flatten(0, 2).shape == shape:
+                return kernel.flatten(0, 2)
     if len(shape) == 2 and tensor.dim() > 2 and tensor.shape[:2] == shape and tensor.numel() == shape.numel():
         return tensor.reshape(shape)
     return None

@@ -30,16 +30,25 @@ def triple(value: int | Triple) -> Triple:
 
 
 class _Convolution(nn.Module):
-    """Kernel and bias shared by the three kinds of convolution; the kernel is ``(kz, ky, kx, C_in, C_out)``."""
+    """Weight ``(K, C_in, C_out)``, the K offsets of the kernel (z, y, x) with x fastest, and bias.
 
-    def __init__(self, in_channels: int, channels: int, kernel: Triple, bias: bool) -> None:
+    The weight has three dimensions so that a network with dense convolutions can be moved to ``channels_last``.
+    """
+
+    def __init__(self, in_channels: int, channels: int, geometry: Geometry, bias: bool) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.empty(*kernel, in_channels, channels))
+        self.geometry = geometry
+        self.weight = nn.Parameter(torch.empty(geometry.offsets, in_channels, channels))
         self.bias = nn.Parameter(torch.empty(channels)) if bias else None
-        bound = 1 / math.sqrt(math.prod(kernel) * in_channels)  # as torch's dense convolutions start
+        bound = 1 / math.sqrt(geometry.offsets * in_channels)  # as torch's dense convolutions start
         nn.init.uniform_(self.weight, -bound, bound)
         if self.bias is not None:
             nn.init.uniform_(self.bias, -bound, bound)
+
+    def kernel(self, scale: Tensor | None = None) -> Tensor:
+        """Return the weight as ``(kz, ky, kx, C_in, C_out)``, each output channel multiplied by ``scale``."""
+        weight = self.weight if scale is None else self.weight * scale
+        return weight.unflatten(0, self.geometry.kernel)
 
 
 class SubmanifoldConv3d(_Convolution):
@@ -53,13 +62,12 @@ class SubmanifoldConv3d(_Convolution):
         dilation: int | Triple = 1,
         bias: bool = True,
     ) -> None:
-        super().__init__(in_channels, channels, triple(kernel), bias)
-        self.geometry = Geometry.centred(triple(kernel), triple(dilation))
+        super().__init__(in_channels, channels, Geometry.centred(triple(kernel), triple(dilation)), bias)
 
     def forward(self, x: SparseTensor, scale: Tensor | None = None, shift: Tensor | None = None) -> SparseTensor:
         """Convolve; ``scale`` and ``shift``, one value an output channel, replace the bias by an affine map."""
-        weight, bias = _scaled(self.weight, self.bias, scale, shift)
-        return submanifold_conv3d(x, weight, bias, self.geometry.dilation)
+        bias = _affine(self.bias, scale, shift)
+        return submanifold_conv3d(x, self.kernel(scale), bias, self.geometry.dilation)
 
 
 class SparseConv3d(_Convolution):
@@ -75,14 +83,14 @@ class SparseConv3d(_Convolution):
         dilation: int | Triple = 1,
         bias: bool = True,
     ) -> None:
-        super().__init__(in_channels, channels, triple(kernel), bias)
-        self.geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
+        geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
+        super().__init__(in_channels, channels, geometry, bias)
 
     def forward(self, x: SparseTensor, scale: Tensor | None = None, shift: Tensor | None = None) -> SparseTensor:
         """Convolve; ``scale`` and ``shift``, one value an output channel, replace the bias by an affine map."""
-        weight, bias = _scaled(self.weight, self.bias, scale, shift)
+        bias = _affine(self.bias, scale, shift)
         geometry = self.geometry
-        return sparse_conv3d(x, weight, bias, geometry.stride, geometry.padding, geometry.dilation)
+        return sparse_conv3d(x, self.kernel(scale), bias, geometry.stride, geometry.padding, geometry.dilation)
 
 
 class InverseConv3d(_Convolution):
@@ -98,21 +106,19 @@ class InverseConv3d(_Convolution):
         dilation: int | Triple = 1,
         bias: bool = True,
     ) -> None:
-        super().__init__(in_channels, channels, triple(kernel), bias)
-        self.geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
+        geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
+        super().__init__(in_channels, channels, geometry, bias)
 
     def forward(self, x: SparseTensor, onto: Sites) -> SparseTensor:
         """Carry features back onto ``onto``."""
         geometry = self.geometry
-        return inverse_conv3d(x, self.weight, onto, self.bias, geometry.stride, geometry.padding, geometry.dilation)
+        return inverse_conv3d(x, self.kernel(), onto, self.bias, geometry.stride, geometry.padding, geometry.dilation)
 
 
-def _scaled(
-    weight: Tensor, bias: Tensor | None, scale: Tensor | None, shift: Tensor | None
-) -> tuple[Tensor, Tensor | None]:
+def _affine(bias: Tensor | None, scale: Tensor | None, shift: Tensor | None) -> Tensor | None:
     if scale is None or shift is None:
-        return weight, bias
-    return weight * scale, shift if bias is None else shift + bias * scale
+        return bias
+    return shift if bias is None else shift + bias * scale
 
 
 class SparseBlock(nn.Module):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import ModuleType
+from collections.abc import Callable
 
 from torch import Tensor
 
@@ -24,23 +24,22 @@ __all__ = [
 ]
 
 
-def _cpu() -> ModuleType:
-    from beambox.ops.sparse_conv import cpu
+def _numba() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.cpu import convolve
 
-    return cpu
+    return convolve
 
 
-BACKENDS = (
-    Backend("numba", can_run_numba, lambda: _cpu().convolve),
-    Backend("reference", always, lambda: reference.convolve),
-)
+def _numba_targets() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.cpu_maps import find_targets
+
+    return find_targets
+
+
+BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.convolve))
 TARGET_BACKENDS = (
-    Backend("numba", can_run_numba, lambda: _cpu().find_targets),
+    Backend("numba", can_run_numba, _numba_targets),
     Backend("reference", always, lambda: reference.find_targets),
-)
-TABLE_BACKENDS = (
-    Backend("numba", can_run_numba, lambda: _cpu().neighbour_table),
-    Backend("reference", always, lambda: reference.neighbour_table),
 )
 
 
@@ -54,8 +53,7 @@ def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
     else:
         keys = choose("find_targets", TARGET_BACKENDS, sites.indices)(sites, geometry)
         target = Sites.from_keys(keys, geometry.output_shape(sites.shape), sites.batch_size)
-    table = choose("neighbour_table", TABLE_BACKENDS, sites.indices)(sites, target, geometry)
-    found = KernelMap(sites, target, geometry, table)
+    found = KernelMap(sites, target, geometry)
     sites.maps[geometry] = found
     return found
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from beambox.checks import BeamboxError, expect_shape
 
 if TYPE_CHECKING:
-    from beambox.ops.sparse_conv.cpu import BlockPairs
+    from beambox.ops.sparse_conv.cpu_maps import BlockPairs
 
 __all__ = ["Geometry", "KernelMap", "Sites", "Triple"]
 
@@ -83,37 +83,43 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class KernelMap:
-    """Which input site feeds which output site through which kernel offset."""
+    """Which input site feeds which output site through which kernel offset; found when first asked for."""
 
     source: Sites
     """The ``V_in`` input sites."""
     target: Sites
     """The ``V_out`` output sites."""
     geometry: Geometry
-    table: Tensor
-    """``(V_out, K)`` int32 row of the input site that reaches an output through an offset, or -1."""
+    """Of the convolution, or of the one that this map inverts."""
     mirror: KernelMap | None = None
     """The map of which this one is the inverse, if it is one."""
 
     @cached_property
     def inverse(self) -> KernelMap:
         """The same pairs read from output to input: the map of the transposed convolution and of gradients."""
-        return self.mirror or KernelMap(self.target, self.source, self.geometry, self._transposed_table(), self)
+        return self.mirror or KernelMap(self.target, self.source, self.geometry, self)
+
+    @cached_property
+    def table(self) -> Tensor:
+        """``(V_out, K)`` int32 row of the input site that reaches an output through an offset, or -1."""
+        if self.mirror is None:
+            from beambox.ops.sparse_conv.reference import neighbour_table
+
+            return neighbour_table(self.source, self.target, self.geometry)
+        forward = self.mirror.table
+        if self.geometry.submanifold:
+            return forward.flip(1).contiguous()  # a centred kernel mirrors itself
+        back = torch.full((len(self.target), forward.shape[1]), -1, dtype=torch.int32, device=forward.device)
+        out_row, offset = torch.nonzero(forward >= 0, as_tuple=True)  # each (input, offset) pair occurs once
+        back[forward[out_row, offset].long(), offset] = out_row.int()
+        return back
 
     @cached_property
     def blocks(self) -> BlockPairs:
         """The same pairs grouped as the CPU works on them."""
-        from beambox.ops.sparse_conv.cpu import group_pairs
+        from beambox.ops.sparse_conv.cpu_maps import find_pairs
 
-        return group_pairs(self.table)
-
-    def _transposed_table(self) -> Tensor:
-        if self.geometry.submanifold:
-            return self.table.flip(1).contiguous()  # a centred kernel mirrors itself
-        back = torch.full((len(self.source), self.table.shape[1]), -1, dtype=torch.int32, device=self.table.device)
-        out_row, offset = torch.nonzero(self.table >= 0, as_tuple=True)  # each (input, offset) pair occurs once
-        back[self.table[out_row, offset].long(), offset] = out_row.int()
-        return back
+        return find_pairs(self.source, self.target, self.geometry, self.mirror is not None)
 
 
 @dataclass(frozen=True, eq=False)

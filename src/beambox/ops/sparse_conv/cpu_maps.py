@@ -1,0 +1,189 @@
+"""Kernel maps on the CPU: outputs walked in ascending order, with one pointer into the inputs for each kernel row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.sparse_conv.sites import Geometry, Sites, Triple
+from beambox.ops.sparse_conv.tiles import ROWS
+
+__all__ = ["BLOCK", "BlockPairs", "find_pairs", "find_targets", "table_of"]
+
+BLOCK = 256
+"""Output rows worked on together, a multiple of the tile's: their sums stay in the second-level cache."""
+
+
+@dataclass(frozen=True)
+class BlockPairs:
+    """The pairs of a kernel map, grouped by block of output rows and then by kernel offset."""
+
+    source: np.ndarray
+    """``(blocks, K, BLOCK)`` int32 input rows."""
+    target: np.ndarray
+    """``(blocks, K, BLOCK)`` int32 output rows."""
+    count: np.ndarray
+    """``(blocks, K)`` int32 pairs of each group. The places up to the next multiple of a tile's rows hold input row 0
+    and an output row of their own behind the last, one a block; places after these are undefined."""
+
+
+def axis_tables(geometry: Geometry, shape: Triple, out_shape: Triple, back: bool) -> tuple[np.ndarray, ...]:
+    """Tell, for each axis, where each kernel offset leads from each coordinate: ``(n, k)`` int64, -1 for nowhere.
+
+    Args:
+        geometry: of the convolution.
+        shape: extent of its input.
+        out_shape: extent of its output.
+        back: from inputs to outputs; else from outputs to inputs.
+    """
+    tables = []
+    sizes = zip(shape, out_shape, geometry.kernel, geometry.stride, geometry.padding, geometry.dilation)
+    for n, m, kernel, stride, padding, dilation in sizes:
+        offset = np.arange(kernel) * dilation - padding
+        if back:
+            scaled = np.arange(n)[:, None] - offset
+            place, fits = scaled // stride, scaled % stride == 0
+            tables.append(np.where(fits & (place >= 0) & (place < m), place, -1))
+        else:
+            place = np.arange(m)[:, None] * stride + offset
+            tables.append(np.where((place >= 0) & (place < n), place, -1))
+    return tuple(tables)
+
+
+def find_targets(source: Sites, geometry: Geometry) -> Tensor:
+    """Return the ascending keys of every output whose receptive field holds an active input."""
+    shape, out_shape = source.shape, geometry.output_shape(source.shape)
+    z, y, x = axis_tables(geometry, shape, out_shape, back=True)
+    found = _reached(source.sorted_keys.numpy(), np.array(shape), np.array(out_shape), z, y, x)
+    found.sort()
+    fresh = np.ones(len(found), dtype=bool)
+    fresh[1:] = found[1:] != found[:-1]
+    return torch.from_numpy(found[fresh])
+
+
+@jit
+def _reached(keys, shape, out_shape, z_table, y_table, x_table):
+    """List the outputs that each input reaches, some more than once."""
+    lines = z_table.shape[1] * y_table.shape[1]
+    out = np.empty(len(keys) * lines * x_table.shape[1], np.int64)
+    last = np.full(lines, -1, np.int64)
+    n = 0
+    for key in keys:
+        x = key % shape[2]
+        rest = key // shape[2]
+        y = rest % shape[1]
+        rest //= shape[1]
+        z = rest % shape[0]
+        b = rest // shape[0]
+        for kz in range(z_table.shape[1]):
+            if z_table[z, kz] < 0:
+                continue
+            for ky in range(y_table.shape[1]):
+                if y_table[y, ky] < 0:
+                    continue
+                line = ((b * out_shape[0] + z_table[z, kz]) * out_shape[1] + y_table[y, ky]) * out_shape[2]
+                of_line = kz * y_table.shape[1] + ky
+                for kx in range(x_table.shape[1] - 1, -1, -1):  # so that x ascends
+                    if x_table[x, kx] >= 0 and line + x_table[x, kx] != last[of_line]:
+                        last[of_line] = line + x_table[x, kx]
+                        out[n] = last[of_line]
+                        n += 1
+    return out[:n].copy()
+
+
+def find_pairs(source: Sites, target: Sites, geometry: Geometry, back: bool) -> BlockPairs:
+    """Find which input row reaches each output row through each kernel offset.
+
+    Args:
+        source: the sites that are read.
+        target: the sites that are written.
+        geometry: of the convolution.
+        back: whether the convolution runs from ``target`` to ``source``, and this is its inverse.
+    """
+    blocks = -(-len(target) // BLOCK)
+    pairs = BlockPairs(
+        np.empty((blocks, geometry.offsets, BLOCK), np.int32),
+        np.empty((blocks, geometry.offsets, BLOCK), np.int32),
+        np.zeros((blocks, geometry.offsets), np.int32),
+    )
+    shapes = (target.shape, source.shape) if back else (source.shape, target.shape)
+    tables = axis_tables(geometry, *shapes, back)
+    keys, order = source.sorted_keys.numpy(), source.order.numpy()
+    out_keys, out_order = target.sorted_keys.numpy(), target.order.numpy()
+    extents = np.array((source.shape, target.shape))
+
+    def find(first: int, last: int) -> None:
+        _find_pairs(
+            keys, order, out_keys, out_order, extents, tables, pairs.source, pairs.target, pairs.count, first, last
+        )
+
+    run_in_blocks(find, blocks, 16)
+    return pairs
+
+
+@jit
+def _find_pairs(keys, order, out_keys, out_order, extents, tables, sources, targets, count, first, last):
+    """Fill the pairs of the blocks from ``first`` to ``last``."""
+    shape, out_shape = extents[0], extents[1]
+    z_table, y_table, x_table = tables
+    size, nz, ny, nx = len(keys), z_table.shape[1], y_table.shape[1], x_table.shape[1]
+    pointer = np.empty(nz * ny, np.int64)
+    for block in range(first, last):
+        start, stop = block * BLOCK, min(len(out_keys), (block + 1) * BLOCK)
+        pointer[:] = -1
+        for i in range(start, stop):
+            x = out_keys[i] % out_shape[2]
+            rest = out_keys[i] // out_shape[2]
+            y = rest % out_shape[1]
+            rest //= out_shape[1]
+            z = rest % out_shape[0]
+            b = rest // out_shape[0]
+            for kz in range(nz):
+                if z_table[z, kz] < 0:
+                    continue
+                for ky in range(ny):
+                    if y_table[y, ky] < 0:
+                        continue
+                    of_line = kz * ny + ky
+                    line = ((b * shape[0] + z_table[z, kz]) * shape[1] + y_table[y, ky]) * shape[2]
+                    at = pointer[of_line]
+                    if at < 0:
+                        at = np.searchsorted(keys, line)
+                    for kx in range(nx):
+                        if x_table[x, kx] < 0:
+                            continue
+                        wanted = line + x_table[x, kx]
+                        while at < size and keys[at] < wanted:
+                            at += 1
+                        while at > 0 and keys[at - 1] >= wanted:
+                            at -= 1
+                        if at < size and keys[at] == wanted:
+                            k = of_line * nx + kx
+                            place = count[block, k]
+                            sources[block, k, place] = order[at]
+                            targets[block, k, place] = out_order[i]
+                            count[block, k] = place + 1
+                    pointer[of_line] = at
+        for k in range(nz * ny * nx):
+            for place in range(count[block, k], -(-count[block, k] // ROWS) * ROWS):
+                sources[block, k, place] = 0
+                targets[block, k, place] = len(out_keys) + block
+
+
+def table_of(pairs: BlockPairs, rows: int) -> Tensor:
+    """Write pairs as a table ``(V_out, K)`` int32 of input rows, -1 for none."""
+    table = np.full((rows, pairs.count.shape[1]), -1, np.int32)
+    _fill_table(pairs.source, pairs.target, pairs.count, table)
+    return torch.from_numpy(table)
+
+
+@jit
+def _fill_table(source, target, count, table):
+    for block in range(count.shape[0]):
+        for k in range(count.shape[1]):
+            for place in range(count[block, k]):
+                table[target[block, k, place], k] = source[block, k, place]
