@@ -72,8 +72,9 @@ def pack(placed: Sequence[Placed], origins: tuple[float, float]) -> _Packed:
 
     Returns:
         planes (F, 4), plane materials (F,), ellipsoids (E, 3, 3), parts (P, 9), first part of each object (O + 1,),
-        patches (Q, 7), first patch of each object (O + 1,), poses (O, 12: rotation then translation), bounds
-        (O, 6: azimuth centre, azimuth half-width, lowest and highest tangent of elevation, nearest distance, labelled).
+        patches (Q, 7), first patch of each object (O + 1,), poses (O, 12: rotation then translation), reaches (O, 6:
+        lowest and highest x, y, z in the object's frame), bounds (O, 6: azimuth centre, azimuth half-width, lowest and
+        highest tangent of elevation, nearest distance, labelled).
     """
     count = len(placed)
     turn = np.array([rotation(p.yaw, p.pitch, p.roll) for p in placed]).reshape(count, 3, 3)
@@ -109,6 +110,7 @@ def pack(placed: Sequence[Placed], origins: tuple[float, float]) -> _Packed:
         patches,
         np.concatenate(([0], np.cumsum(patch_count))),
         np.concatenate((turn.reshape(count, 9), shift), axis=1),
+        np.array([[*s.low, *s.high] for s in shapes]).reshape(count, 6),
         _bounds(placed, shift, origins),
     )
 
@@ -270,6 +272,22 @@ def _hit_part(
 
 
 @numba.njit(cache=True, nogil=True)
+def _misses(pose: np.ndarray, reach: np.ndarray, oz: float, dx: float, dy: float, dz: float) -> bool:
+    """Tell whether a beam passes the box around an object, in the object's own frame."""
+    enter, leave = 0.0, _NO_HIT
+    for k in range(3):
+        slope = pose[k] * dx + pose[3 + k] * dy + pose[6 + k] * dz
+        start = -pose[k] * pose[9] - pose[3 + k] * pose[10] + pose[6 + k] * (oz - pose[11])
+        if abs(slope) < 1e-12:
+            if start < reach[k] or start > reach[3 + k]:
+                return True
+            continue
+        a, b = (reach[k] - start) / slope, (reach[3 + k] - start) / slope
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    return enter > leave
+
+
+@numba.njit(cache=True, nogil=True)
 def _patched(patches: np.ndarray, first: int, last: int, pose: np.ndarray, x: float, y: float, z: float) -> int:
     """Material of the patch that covers a point of an object, or -1."""
     px, py, pz = x - pose[9], y - pose[10], z - pose[11]
@@ -285,7 +303,7 @@ def _patched(patches: np.ndarray, first: int, last: int, pose: np.ndarray, x: fl
 
 @numba.njit(cache=True, nogil=True)
 def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out) -> None:
-    planes, plane_material, ellipsoids, parts, part_start, patches, patch_start, poses, bounds = packed
+    planes, plane_material, ellipsoids, parts, part_start, patches, patch_start, poses, reaches, bounds = packed
     distance, owner, material, cosine, alone, got = out
     start, index = _columns(bounds, azimuths, step)
     for b in range(len(beams)):
@@ -312,6 +330,8 @@ def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out
                     continue
                 labelled = bounds[o, 5] > 0.5
                 if bounds[o, 4] > best * 1.001 and not labelled:
+                    continue
+                if _misses(poses[o], reaches[o], oz, dx, dy, se):
                     continue
                 mine, my_material, my_cos = _NO_HIT, 0, 1.0
                 for p in range(part_start[o], part_start[o + 1]):
@@ -355,7 +375,7 @@ def cast(
     Args:
         packed: the objects, from :func:`pack`.
         ground: from ``Ground.pack``.
-        table: ``(M, 6)`` from ``Palette.table``.
+        table: ``(M, 7)`` from ``Palette.table``.
         seed: of the hashes inside.
         azimuths: ``(C,)`` radians.
         phases: ``(B,)`` radians added to the azimuths of each beam, at most a step.

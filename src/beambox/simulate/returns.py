@@ -10,7 +10,7 @@ from beambox.simulate.sensors import Sensor
 __all__ = ["measure"]
 
 _FULL_POWER = 75.0  # metres; a surface of power 1 at right incidence is lost in 1/e of cases there
-_DARK = 0.055  # intensities below this read as zero
+_DARK = 0.085  # intensities below this read as zero
 
 
 def measure(hits: Hits, beams: np.ndarray, directions: np.ndarray, table: np.ndarray, sensor: Sensor,
@@ -21,7 +21,7 @@ def measure(hits: Hits, beams: np.ndarray, directions: np.ndarray, table: np.nda
         hits: of ``(R,)`` beams.
         beams: ``(R,)`` z at which each leaves, metres.
         directions: ``(R, 3)`` unit vectors.
-        table: ``(M, 6)`` materials, see ``Palette``.
+        table: ``(M, 7)`` materials, see ``Palette``.
         sensor: its noise, range and sensitivity.
         rng: source of the noise.
 
@@ -37,10 +37,13 @@ def measure(hits: Hits, beams: np.ndarray, directions: np.ndarray, table: np.nda
     power = sensor.sensitivity * weather * material[:, 3] * cosine ** material[:, 4]
     seen = luck < 0.985 * (1.0 - np.exp(-power * (_FULL_POWER / np.maximum(distance, 1.0)) ** 2))
     seen &= np.isfinite(hits.distance) & (hits.distance > sensor.min_range) & (hits.distance < sensor.max_range)
-    # Far returns read darker, as KITTI's do beyond 25 m.
-    fade = np.clip(1.0 - (distance - 22.0) / 60.0, 0.15, 1.0)
-    intensity = gain * material[:, 0] * cosine ** material[:, 1] * fade + material[:, 2] * lit
-    intensity[intensity < _DARK] = 0.0
+    # Very near and far returns read darker, as KITTI's do.
+    fade = np.where(
+        distance < 16.0, 0.8 + 0.2 * distance / 16.0, 1.0 / (1.0 + (np.maximum(distance - 16.0, 0) / 20.0) ** 2)
+    )
+    bright = material[:, 0] * cosine ** material[:, 1] + material[:, 6] * cosine**25
+    intensity = gain * bright * fade + material[:, 2] * np.sqrt(fade) * lit
+    intensity[intensity < _DARK * (1.0 + 0.3 * lit)] = 0.0
     intensity = np.clip(np.round(intensity / sensor.intensity_step) * sensor.intensity_step, 0.0, 0.99)
     reach = distance + sensor.range_noise * noise
     xyz = directions * reach[:, None]

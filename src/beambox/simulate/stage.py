@@ -99,7 +99,13 @@ class Stage:
     def free(self, x: float, y: float, length: float, width: float, yaw: float, gap: float = 0.15) -> bool:
         """Tell whether a footprint touches nothing that is there."""
         rectangle = np.array([x, y, length / 2 + gap, width / 2 + gap, yaw])
-        return not bool(overlaps(rectangle, self._taken).any())
+        away = np.hypot(self._taken[:, 0] - x, self._taken[:, 1] - y)
+        near = away < np.hypot(self._taken[:, 2], self._taken[:, 3]) + math.hypot(rectangle[2], rectangle[3])
+        return not bool(overlaps(rectangle, self._taken[near]).any())
+
+    def sees(self, x: float, y: float, reach: float = 6.0) -> bool:
+        """Tell whether something of that reach at a place can get beams: everywhere, or before the camera."""
+        return self.ahead < 0 or (x > -reach and abs(y) < 0.95 * max(x, 0.0) + 1.5 * reach)
 
     def add_object(
         self, name: str, x: float, y: float, yaw: float, size: tuple[float, float, float] | None = None,
@@ -117,7 +123,7 @@ class Stage:
             force: put it even where it overlaps another.
         """
         size = size or draw_size(name, self.rng)
-        if not force and not self.free(x, y, size[0], size[1], yaw):
+        if not force and not (self.sees(x, y) and self.free(x, y, size[0], size[1], yaw)):
             return False
         z, along, across = self.ground.tilt(self.packed_ground, x, y, yaw, size[0], size[1])
         z = float(z) if bottom is None else bottom

@@ -29,7 +29,7 @@ def random_ground(roads: tuple[Road, ...], rng: np.random.Generator, height: flo
     wave = math.tau / length
     waves = np.stack((amplitude, wave * np.cos(angle), wave * np.sin(angle), phase), axis=1)
     return Ground(
-        height=-height + rng.normal(-0.04, 0.03),
+        height=-height + rng.normal(-0.05, 0.03),
         slope=(rng.normal(0.0080, 0.005), rng.normal(0.0, 0.010)),
         bend=(rng.normal(0.0, 0.00025), rng.normal(0.0, 0.00025)),
         waves=waves,
@@ -139,14 +139,34 @@ def dress(stage: Stage, road: Road) -> None:
     for side in (1.0, -1.0):
         edge = road.half_width + road.pavement
         _verge(stage, line, side, edge)
-        built = rng.random()
-        if built < 0.85:
-            _fronts(stage, line, side, edge + rng.uniform(0.2, 9.0), rng.uniform(0.3, 1.0))
+        if rng.random() < 0.9:
+            _fronts(stage, line, side, edge + rng.uniform(0.2, 9.0), rng.uniform(0.4, 1.0))
+        if rng.random() < 0.35:
+            _thicket(stage, line, side, edge + rng.uniform(0.5, 6.0))
         _clutter(stage, line, side, edge, int(rng.integers(2, 14)))
-    for _ in range(rng.integers(4, 25)):
+        if rng.random() < 0.7:  # what stands behind
+            _fronts(stage, line, side, edge + rng.uniform(14.0, 32.0), rng.uniform(0.5, 1.0), low=4.0)
+    for _ in range(rng.integers(4, 30)):
         x, y = rng.uniform(stage.ahead or 5.0, _REACH), rng.uniform(-45, 45)
-        if abs(y) > 6:
-            stage.add_scenery(scenery.tree(rng.uniform(3, 12), stage.palette, rng), x, y, rng.uniform(0, math.tau))
+        if abs(y) > 6 and stage.sees(x, y):
+            stage.add_scenery(scenery.tree(rng.uniform(3, 14), stage.palette, rng), x, y, rng.uniform(0, math.tau))
+
+
+def _thicket(stage: Stage, line: _Line, side: float, setback: float) -> None:
+    """A belt of bushes and trees along the road."""
+    rng = stage.rng
+    u, depth = stage.ahead + rng.uniform(4, 25), rng.uniform(1.0, 6.0)
+    end = min(u + rng.uniform(10, 70), _REACH)
+    while u < end:
+        x, y, _ = line.at(u, side * (setback + rng.uniform(0, depth)))
+        u += rng.uniform(0.5, 2.5)
+        if not stage.sees(x, y):
+            continue
+        size = rng.uniform(0.8, 3.0)
+        shape = scenery.bush(size, size * rng.uniform(0.6, 1.4), stage.palette, rng)
+        if rng.random() < 0.25:
+            shape = scenery.tree(rng.uniform(3, 9), stage.palette, rng)
+        stage.add_scenery(shape, x, y, rng.uniform(0, math.tau), gap=-0.2)
 
 
 def _verge(stage: Stage, line: _Line, side: float, edge: float) -> None:
@@ -157,44 +177,46 @@ def _verge(stage: Stage, line: _Line, side: float, edge: float) -> None:
     trees = rng.random() < 0.4
     while u < _REACH:
         x, y, direction = line.at(u, side * (road.half_width + rng.uniform(0.25, 0.9)))
+        u += step * rng.uniform(0.5, 1.5)
+        if not stage.sees(x, y):
+            continue
         if trees and rng.random() < 0.7:
             shape = scenery.tree(rng.uniform(4, 11), stage.palette, rng)
         else:
             shape = scenery.pole(rng.uniform(1.0, 8.0), stage.palette, rng)
         stage.add_scenery(shape, x, y, direction + yaw_side, gap=0.1)
-        u += step * rng.uniform(0.5, 1.5)
     if rng.random() < 0.1:
         for k in range(int((_REACH - stage.ahead) // 6)):
             x, y, direction = line.at(stage.ahead + 6.0 * k, side * (edge + 0.2))
             stage.add_scenery(scenery.rail(6.0, stage.palette, rng), x, y, direction, gap=0.0)
 
 
-def _fronts(stage: Stage, line: _Line, side: float, setback: float, fill: float) -> None:
-    """Houses, walls, hedges and fences in a row."""
+def _fronts(stage: Stage, line: _Line, side: float, setback: float, fill: float, low: float = 0.0) -> None:
+    """Houses, walls, hedges and fences in a row, at least ``low`` metres high."""
     rng = stage.rng
-    weights = rng.dirichlet((1.2, 0.6, 0.6, 0.4))
+    weights = rng.dirichlet((1.2, 0.6, 0.6, 0.4)) if low == 0 else (0.9, 0.0, 0.1, 0.0)
     u = stage.ahead + rng.uniform(-5, 5)
     while u < _REACH + 10:
         length = rng.uniform(4, 16)
         kind = rng.choice(4, p=weights)
         pieces = 1 if kind == 0 and not stage.guard else max(1, int(length // 3.0))
-        height = rng.uniform(2.6, 11.0) if kind == 0 else rng.uniform(0.5, 2.4)
+        height = max(low, rng.uniform(2.6, 12.0) if kind == 0 else rng.uniform(0.5, 2.4))
         depth = rng.uniform(4, 10)
         for k in range(pieces):
             part = length / pieces
             place = u + (k + 0.5) * part
             x, y, direction = line.at(place, side * setback)
             yaw = direction if side > 0 else direction + math.pi
-            if rng.random() > fill:
+            if rng.random() > fill or not stage.sees(x, y, max(part, depth)):
                 continue
             if kind == 0:
-                shape = scenery.house(part, depth, height, stage.palette, rng)
+                shape = scenery.house(part - 0.3, depth, height, stage.palette, rng)
             elif kind == 1:
-                shape = scenery.wall(part, height, stage.palette, rng)
+                shape = scenery.wall(part - 0.25, height, stage.palette, rng)
             elif kind == 2:
-                shape = scenery.hedge(part, height, stage.palette, rng)
+                shape = scenery.hedge(part - 0.25, height, stage.palette, rng)
             else:
-                shape = scenery.fence(part, height, stage.palette, rng)
+                shape = scenery.fence(part - 0.25, height, stage.palette, rng)
             stage.add_scenery(shape, x, y, yaw, gap=0.0)
         u += length + (rng.uniform(0, 8) if rng.random() < 0.4 else 0.0)
         setback += rng.normal(0, 0.4)
@@ -207,6 +229,8 @@ def _clutter(stage: Stage, line: _Line, side: float, edge: float, count: int) ->
         u = rng.uniform(stage.ahead + 4, 60)
         x, y, direction = line.at(u, side * (edge + rng.uniform(-1.2, 12.0)))
         kind, turn = rng.random(), rng.uniform(0, math.tau)
+        if not stage.sees(x, y):
+            continue
         if kind < 0.35:
             shape = scenery.bush(rng.uniform(0.6, 2.2), rng.uniform(0.4, 2.4), stage.palette, rng)
         elif kind < 0.55:

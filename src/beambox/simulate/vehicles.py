@@ -87,6 +87,9 @@ def _plan_planes(
         c, s = math.cos(b), math.sin(b)
         reach = hx * c + 0.3 * hy * s
         planes += [(end * c, s, 0.0, reach, paint), (end * c, -s, 0.0, reach, paint)]
+        c, s = math.sin(0.05), math.cos(0.05)  # the flanks draw in towards the ends
+        reach = 0.4 * hx * c + hy * s
+        planes += [(end * c, s, 0.0, reach, paint), (end * c, -s, 0.0, reach, paint)]
     return planes
 
 
@@ -179,8 +182,8 @@ def car(size: tuple[float, float, float], palette: Palette, rng: np.random.Gener
     """A passenger car of (length, width, height) metres in one of :data:`CAR_STYLES`."""
     length, width, h = size
     shape, style, paint = Shape(), _style_of(length, h, rng), palette.paint()
-    hx, hy = length / 2, width / 2
-    top = h - rng.uniform(0.0, 0.05)
+    hx, hy = length / 2 - rng.uniform(-0.01, 0.06), width / 2 - rng.uniform(-0.01, 0.035)  # annotators leave a margin
+    top = h - rng.uniform(0.0, 0.09)
     belt, nose = rng.uniform(*style.belt) * h, rng.uniform(*style.nose) * h
     clear = rng.uniform(0.11, 0.15) * h
     x_cowl, x_tail = rng.uniform(*style.cowl) * hx, -rng.uniform(*style.tail) * hx
@@ -208,7 +211,7 @@ def car(size: tuple[float, float, float], palette: Palette, rng: np.random.Gener
                   (x_rear, rng.uniform(0.945, 0.985) * top)]  # fmt: skip
     dark_tail = PANE if rng.random() < 0.25 else GLASS
     _greenhouse(shape, glasshouse, (hy * 0.955, hy * rng.uniform(0.68, 0.8)), paint, GLASS, dark_tail)
-    _seats(shape, min(x_front - 0.15, 0.05 * hx), max(x_tail + 0.35, -0.62 * hx), hy, h, rng)
+    _seats(shape, min(x_front, -rng.uniform(0.12, 0.26) * hx), -rng.uniform(0.48, 0.58) * hx, hy, h, rng)
     _wheels(
         shape,
         (rng.uniform(0.58, 0.66) * hx, -rng.uniform(0.56, 0.66) * hx),
