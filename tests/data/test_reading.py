@@ -248,13 +248,13 @@ def test_an_absent_library_comes_with_its_remedy(monkeypatch: pytest.MonkeyPatch
         library("pypcd4", Path("a.pcd"))
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(SUFFIXES), st.binary(max_size=400), st.randoms(use_true_random=False), st.integers(0, 3))
 def test_no_bytes_make_a_reader_fail_otherwise(tmp_path: Path, suffix: str, noise: bytes, random, kind: int) -> None:
     """Random bytes, and good files with bytes changed, cut or added, give a frame or a BeamboxError: nothing else."""
     path = write(tmp_path / f"good{suffix}", CLOUD[:5], how="binary_compressed" if kind == 1 else "")
     content = bytearray(path.read_bytes())
-    if kind == 0 or suffix == ".laz":
+    if kind == 0:
         content = bytearray(noise)
     elif kind == 1:
         del content[random.randrange(len(content)) :]
