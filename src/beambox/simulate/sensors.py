@@ -76,6 +76,11 @@ _HDL64_LOWER = (
     -22.439, -22.856, -23.322, -23.971, -24.507, -25.000,
 )  # fmt: skip
 
+_HESAI_TOP, _HESAI_BOTTOM = (
+    (15.0, 11.0, 8.0, 5.0, 3.0),
+    (-7.0, -8.0, -9.0, -10.0, -11.0, -12.0, -13.0, -14.0, -19.0, -25.0),
+)
+
 SENSORS: dict[str, Sensor] = {
     "hdl64": Sensor(
         name="hdl64",
@@ -84,6 +89,33 @@ SENSORS: dict[str, Sensor] = {
         azimuth_step=0.1797,
         height=1.73,
         max_range=80.0,
+    ),
+    # Velodyne HDL-32E: 32 beams from +10.67 to -30.67 degrees in steps of 4/3 (manual), here on a low campus vehicle.
+    "hdl32": Sensor(
+        name="hdl32",
+        elevations=tuple(round(10.67 - i * 4 / 3, 3) for i in range(32)),
+        azimuth_step=0.1667,
+        height=1.2,
+        max_range=80.0,
+        sensitivity=0.8,
+    ),
+    # Hesai Pandar40: +2 to -6 degrees in steps of 1/3, coarser above and below (manual); ONCE's cars carry such a sensor.
+    "pandar40": Sensor(
+        name="pandar40",
+        elevations=_HESAI_TOP + tuple(round(2 - i / 3, 3) for i in range(25)) + _HESAI_BOTTOM,
+        azimuth_step=0.2,
+        height=1.8,
+        max_range=120.0,
+        sensitivity=1.5,
+    ),
+    # Hesai Pandar64: +2 to -6 degrees in steps of 1/6 (manual).
+    "pandar64": Sensor(
+        name="pandar64",
+        elevations=_HESAI_TOP + tuple(round(2 - i / 6, 3) for i in range(49)) + _HESAI_BOTTOM,
+        azimuth_step=0.2,
+        height=1.8,
+        max_range=120.0,
+        sensitivity=1.5,
     ),
 }
 
