@@ -42,7 +42,7 @@ def annotate(
     """
     chosen = [i for i, p in enumerate(placed) if p.name and got[i] > 0]
     boxes = torch.tensor([placed[i].box for i in chosen], dtype=torch.float64).reshape(-1, 7)
-    names = [placed[i].name for i in chosen]
+    names = tuple(placed[i].name for i in chosen)
     wide, clipped = calibration.to_camera(boxes), calibration.to_camera(boxes, image_size)
     size = wide.image[:, 2:] - wide.image[:, :2]
     inside = (clipped.image[:, 2:] - clipped.image[:, :2]).clamp(min=0)

@@ -99,7 +99,7 @@ SENSORS: dict[str, Sensor] = {
         max_range=80.0,
         sensitivity=0.8,
     ),
-    # Hesai Pandar40: +2 to -6 degrees in steps of 1/3, coarser above and below (manual); ONCE's cars carry such a sensor.
+    # Hesai Pandar40: +2 to -6 degrees in steps of 1/3, coarser beyond (manual); as on the cars of ONCE.
     "pandar40": Sensor(
         name="pandar40",
         elevations=_HESAI_TOP + tuple(round(2 - i / 3, 3) for i in range(25)) + _HESAI_BOTTOM,

@@ -183,7 +183,7 @@ def car(size: tuple[float, float, float], palette: Palette, rng: np.random.Gener
     length, width, h = size
     shape, style, paint = Shape(), _style_of(length, h, rng), palette.paint()
     hx, hy = length / 2 - rng.uniform(-0.01, 0.06), width / 2 - rng.uniform(-0.01, 0.035)  # annotators leave a margin
-    top = h - rng.uniform(0.0, 0.09)
+    top = h - rng.uniform(0.0, 0.07)
     belt, nose = rng.uniform(*style.belt) * h, rng.uniform(*style.nose) * h
     clear = rng.uniform(0.11, 0.15) * h
     x_cowl, x_tail = rng.uniform(*style.cowl) * hx, -rng.uniform(*style.tail) * hx
