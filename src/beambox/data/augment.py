@@ -13,12 +13,14 @@ from typing import Annotated
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
 
 from beambox.checks import BeamboxError
 from beambox.data.database import ObjectDatabase
-from beambox.data.footprints import inside_box, overlap_bev
+from beambox.data.footprints import overlap_bev
 from beambox.data.road import fit_road_plane
 from beambox.geometry.boxes import flip_boxes_x, flip_boxes_y, rotate_boxes, scale_boxes
+from beambox.ops.points_in_boxes import points_in_boxes
 from beambox.structures import Frame, Labels
 
 __all__ = [
@@ -135,10 +137,8 @@ def sample_objects(frame: Frame, config: AugmentConfig, database: ObjectDatabase
             f"frame {frame.id} has {scene.shape[1]} point columns, the object database {database.points.shape[1]}; "
             "build the database from frames read with the same fields"
         )
-    keep = np.ones(len(scene), dtype=bool)
-    for box in boxes.astype(np.float64):
-        keep[inside_box(scene, box)] = False
-    points = np.concatenate((database.points_of(objects, boxes[:, :3]), scene[keep]))
+    hidden = points_in_boxes(frame.points, torch.from_numpy(boxes)).numpy() >= 0  # (N,)
+    points = np.concatenate((database.points_of(objects, boxes[:, :3]), scene[~hidden]))
     together = Labels(torch.from_numpy(np.concatenate((scene_boxes, boxes))), (*labels.names, *names))
     return replace(frame, points=torch.from_numpy(points), labels=together)
 
@@ -160,12 +160,13 @@ def move_objects(
         trials: draws an object gets; the first that overlaps no other box, seen from above, holds.
     """
     labels = _labels(frame)
+    if len(labels) == 0:
+        return frame
     boxes = labels.boxes.numpy().astype(np.float64)  # (N, 7), changed below
     turns = rng.uniform(-rotation, rotation, (len(boxes), trials))
     shifts = rng.normal(0.0, 1.0, (len(boxes), trials, 3)) * translation
     cloud = frame.points.numpy().copy()
-    owned = _rows_of_objects(cloud, boxes)
-    for k, rows in enumerate(owned):
+    for k, rows in enumerate(_rows_of_objects(frame, labels.boxes)):
         tries = np.repeat(boxes[k : k + 1], trials, axis=0)  # (trials, 7)
         tries[:, :3] += shifts[k]
         tries[:, 6] += turns[k]
@@ -181,13 +182,12 @@ def move_objects(
     return replace(frame, points=torch.from_numpy(cloud), labels=labels.with_boxes(torch.from_numpy(boxes)))
 
 
-def _rows_of_objects(cloud: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
+def _rows_of_objects(frame: Frame, boxes: Tensor) -> list[np.ndarray]:
     """Point indices inside each box; a point in two boxes belongs to the first."""
-    owner = np.full(len(cloud), -1, dtype=np.int64)
-    rows = [inside_box(cloud, box) for box in boxes]
-    for k in range(len(rows) - 1, -1, -1):
-        owner[rows[k]] = k
-    return [own[owner[own] == k] for k, own in enumerate(rows)]
+    owner = points_in_boxes(frame.points, boxes).numpy()
+    inside = np.flatnonzero(owner >= 0)
+    inside = inside[np.argsort(owner[inside], kind="stable")]
+    return np.split(inside, np.searchsorted(owner[inside], np.arange(1, len(boxes))))
 
 
 def _first_free(tries: np.ndarray, others: np.ndarray) -> int | None:
@@ -236,7 +236,7 @@ def scale(frame: Frame, factor: float) -> Frame:
 
 def shuffle_points(frame: Frame, rng: np.random.Generator) -> Frame:
     """Put the points in random order."""
-    return frame.with_points(frame.points[torch.from_numpy(rng.permutation(len(frame)))])
+    return frame.with_points(torch.from_numpy(frame.points.numpy()[rng.permutation(len(frame))]))
 
 
 def _labels(frame: Frame) -> Labels:

@@ -10,10 +10,11 @@ import numpy as np
 
 from beambox.checks import BeamboxError, did_you_mean, expect_same_length
 from beambox.data.files import replacing
-from beambox.data.footprints import inside_box, overlap_bev
+from beambox.data.footprints import overlap_bev
 from beambox.data.formats.columns import decode
 from beambox.data.source import FrameSource
 from beambox.data.walk import walk
+from beambox.ops.points_in_boxes import points_in_boxes_mask
 
 __all__ = ["ObjectDatabase"]
 
@@ -85,16 +86,16 @@ class ObjectDatabase:
             keep = frame.labels.class_index(classes)
             if drop_unknown_difficulty and frame.labels.attributes is not None:
                 keep[frame.labels.attributes.difficulty() < 0] = -1
-            cloud, all_boxes = frame.points.numpy(), frame.labels.boxes.numpy()
-            for k in np.flatnonzero(keep.numpy() >= 0):
-                rows = inside_box(cloud, all_boxes[k].astype(np.float64))
-                if len(rows) < max(1, min_points):
+            kept = frame.labels.boxes[keep >= 0]
+            inside = points_in_boxes_mask(frame.points, kept).numpy()  # (M, N)
+            for box, label, rows in zip(kept.numpy(), keep[keep >= 0].tolist(), inside):
+                own = frame.points.numpy()[rows]
+                if len(own) < max(1, min_points):
                     continue
-                own = cloud[rows].copy()
-                own[:, :3] -= all_boxes[k, :3]
-                boxes.append(all_boxes[k])
+                own[:, :3] -= box[:3]
+                boxes.append(box)
                 chunks.append(own)
-                labels.append(int(keep[k]))
+                labels.append(label)
                 frames.append(frame.id)
             if progress is not None:
                 progress(number + 1, len(source))

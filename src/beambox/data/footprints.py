@@ -1,10 +1,10 @@
-"""Quick tests on boxes seen from above, in NumPy: augmentation runs them on few boxes, many times a second."""
+"""Which boxes overlap seen from above, in NumPy: augmentation asks it of few boxes, a thousand times a second."""
 
 from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["inside_box", "overlap_bev"]
+__all__ = ["overlap_bev"]
 
 
 def overlap_bev(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -29,20 +29,3 @@ def overlap_bev(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         & (np.abs(dx * cos_b + dy * sin_b) < lb + la * cos + wa * sin)
         & (np.abs(dy * cos_b - dx * sin_b) < wb + la * sin + wa * cos)
     )
-
-
-def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Return the indices of the points inside a box, borders included, ascending.
-
-    Args:
-        points: ``(N, 3 or more)``.
-        box: ``(7,)``.
-    """
-    reach = np.float32(np.hypot(box[3], box[4]) / 2 + 1e-3)
-    near = np.flatnonzero(np.abs(points[:, 0] - np.float32(box[0])) <= reach)
-    near = near[np.abs(points[near, 1] - np.float32(box[1])) <= reach]
-    offset = points[near, :3].astype(np.float64) - box[:3]  # (K, 3)
-    cos, sin = np.cos(box[6]), np.sin(box[6])
-    along = np.abs(offset[:, 0] * cos + offset[:, 1] * sin)
-    across = np.abs(offset[:, 1] * cos - offset[:, 0] * sin)
-    return near[(along <= box[3] / 2) & (across <= box[4] / 2) & (np.abs(offset[:, 2]) <= box[5] / 2)]

@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -105,8 +106,8 @@ class KittiSource:
             self._refuse_without_calibration(name)
             notes = (f"no calib/{name}.txt: {CALIBRATION_REMEDY}",)
         raw = torch.from_numpy(read_bin(self.path("velodyne", name)))
-        finite = raw.isfinite().all(dim=1)
-        if not bool(finite.all()):
+        if not math.isfinite(float(raw.sum())):  # far cheaper than to look at every number, and hardly ever so
+            finite = raw.isfinite().all(dim=1)
             notes += (f"dropped {int((~finite).sum())} of {len(raw)} points that are NaN or infinite",)
             raw = raw[finite]
         image_path = self._image_path(name)

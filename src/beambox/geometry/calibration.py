@@ -79,11 +79,16 @@ class Calibration:
         return projected[:, :2] / xyz[:, 2:3].double(), projected[:, 2] - self.p2[2, 3]
 
     def in_view(self, points: Tensor, image_size: tuple[int, int]) -> Tensor:
-        """Tell which ``(N, 3 or more)`` LiDAR points fall into an image of (width, height): ``(N,)`` bool."""
-        pixels, depth = self.rect_to_image(self.lidar_to_rect(points[:, :3]))
+        """Tell which ``(N, 3 or more)`` LiDAR points fall into an image of (width, height): ``(N,)`` bool.
+
+        The test is 0 <= u < width, 0 <= v < height, depth >= 0 with :meth:`rect_to_image`'s pixels; here it is
+        multiplied by the depth and done in one product, since it runs over whole sweeps.
+        """
+        matrix = self.lidar_to_rect_matrix
+        rows = torch.cat((self.p2[:2] @ matrix, matrix[2:3]))  # (3, 4): u * depth, v * depth, depth
+        across, down, depth = torch.addmm(rows[:, 3:], rows[:, :3], points[:, :3].double().T)  # (N,) each
         width, height = image_size
-        u, v = pixels[:, 0], pixels[:, 1]
-        return (u >= 0) & (u < width) & (v >= 0) & (v < height) & (depth >= 0)
+        return (depth >= 0) & (across >= 0) & (across < width * depth) & (down >= 0) & (down < height * depth)
 
     def from_camera(self, location: Tensor, size: Tensor, rotation_y: Tensor) -> Tensor:
         """Turn label boxes into LiDAR boxes.
