@@ -156,6 +156,8 @@ def test_the_intensity_scale_can_be_given() -> None:
     cloud = np.full((2, 4), 50.0)
     points, notes = points_from_array(torch.from_numpy(cloud), intensity_scale=0.01)
     assert points[:, 3].tolist() == [0.5, 0.5] and notes == ("intensity multiplied by 0.01 as asked",)
+    assert points_from_array(cloud, intensity_scale=1)[1] == ("2 of 2 intensities lie outside [0, 1]",)
+    assert points_from_array(cloud, intensity_scale=1)[0][:, 3].tolist() == [50, 50]
     with pytest.raises(BeamboxError, match="`intensity_scale` must be a positive number, got -1"):
         points_from_array(cloud, intensity_scale=-1)
 

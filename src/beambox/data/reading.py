@@ -7,8 +7,8 @@
 * whole numbers of 8 bits: divided by 255; wider ones: by 255 where none is larger, else by 65535, else by the largest.
 
 "Nearly all" is all but one in a thousand, so that a few stray values do not darken a whole sweep; what lies outside
-[0, 1] after scaling is clipped. ``intensity_scale`` replaces the rule by a factor (0.01 for percent). A file without
-intensity gets 0. Whatever was decided stands in :attr:`Frame.notes`.
+[0, 1] after scaling is clipped. ``intensity_scale`` replaces the rule by a factor (0.01 for percent) and clips nothing.
+A file without intensity gets 0. Whatever was decided stands in :attr:`Frame.notes`.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def points_from_array(
     Returns:
         ``(N, 4)`` float32 points and what was decided.
     """
-    numbers = array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+    numbers = np.asarray(array.detach().cpu() if isinstance(array, Tensor) else array)
     return _assemble(array_columns(numbers, "the array of points"), "the array of points", None, intensity_scale)
 
 
@@ -193,7 +193,7 @@ def _scaled_intensity(array: np.ndarray, scale: float | None) -> tuple[np.ndarra
     if scale is not None:
         if not (math.isfinite(scale) and scale > 0):
             raise BeamboxError(f"`intensity_scale` must be a positive number, got {scale}")
-        notes = [f"intensity multiplied by {scale:g} as asked"]
+        notes = [] if scale == 1 else [f"intensity multiplied by {scale:g} as asked"]
         factor = np.float32(scale)
     else:
         top = _largest(array, usual)
@@ -202,7 +202,9 @@ def _scaled_intensity(array: np.ndarray, scale: float | None) -> tuple[np.ndarra
     values = values * factor
     with np.errstate(invalid="ignore"):
         outside = int(((values < 0) | (values > 1)).sum())
-    if outside:
+    if outside and scale is not None:
+        notes.append(f"{outside} of {len(values)} intensities lie outside [0, 1]")
+    elif outside:
         notes.append(f"clipped {outside} of {len(values)} intensities to [0, 1]")
         values = values.clip(0, 1)
     return values, notes
