@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from beambox.export.openpcdet import import_checkpoint
+from beambox.layers.roi import Rois, decode_rois
 from beambox.structures import Batch, Frame
 from oracles.paths import fixtures_dir
 
@@ -76,3 +77,24 @@ def test_single_stage_agrees(model):
         index = recorded["index"].long()
         assert relative_error(predictions.cls[0, index], recorded["cls"]) < RELATIVE
         compare_boxes(boxes[index], recorded["box"])
+
+
+def test_two_stage_agrees():
+    for checkpoint, path in recordings("voxel_rcnn"):
+        recorded = read(path)
+        network = detector(checkpoint, "voxel_rcnn")
+        batch = Batch.of([Frame(recorded["points"])])
+        given = recorded["rois"]
+        zeros = torch.zeros(len(given), dtype=torch.int64)
+        with torch.inference_mode():
+            predictions = network(batch)
+            refined = network.refine(Rois(given, zeros, zeros, 1), predictions.levels, network.config.grid)
+            boxes = decode_rois(refined.codes, given)
+        index = recorded["rpn_index"].long()
+        assert relative_error(predictions.first.cls[0, index], recorded["rpn_cls"]) < RELATIVE
+        compare_boxes(predictions.first.decoded()[0, index], recorded["rpn_box"])
+        assert relative_error(refined.cls[:, None], recorded["rcnn_cls"]) < RELATIVE
+        # The second stage moves its regions little: its own work is the difference.
+        ours, theirs = boxes - given, recorded["rcnn_box"] - given
+        ours[:, 6], theirs[:, 6] = turned(ours[:, 6]), turned(theirs[:, 6])
+        assert relative_error(ours, theirs) < RELATIVE

@@ -13,6 +13,7 @@ from beambox.checks import BeamboxError, did_you_mean
 from beambox.detectors.hcnet import HCNetConfig, hcnet
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
 from beambox.detectors.second import SecondConfig, second
+from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
 
 __all__ = ["CATALOGUE", "CatalogueEntry", "build", "config_from_dict", "config_to_dict"]
 
@@ -29,6 +30,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
     "hcnet": CatalogueEntry(HCNetConfig, hcnet),
     "pointpillars": CatalogueEntry(PointPillarsConfig, pointpillars),
     "second": CatalogueEntry(SecondConfig, second),
+    "voxel_rcnn": CatalogueEntry(VoxelRcnnConfig, voxel_rcnn),
 }
 
 

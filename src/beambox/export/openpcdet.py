@@ -17,7 +17,11 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
-from beambox.detectors.second import KITTI_CAR, ONCE, SecondConfig, second
+from beambox.detectors.second import KITTI_CAR, SecondConfig, second
+from beambox.detectors.second import ONCE as SECOND_ONCE
+from beambox.detectors.voxel_rcnn import KITTI as VOXEL_RCNN_KITTI
+from beambox.detectors.voxel_rcnn import ONCE as VOXEL_RCNN_ONCE
+from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import ONCE_ANCHORS
 
@@ -42,6 +46,26 @@ def second_names(config: SecondConfig) -> Names:
     yield from encoder_names()
     yield from bev_names(config.depths)
     yield from head_names()
+
+
+def voxel_rcnn_names(config: VoxelRcnnConfig) -> Names:
+    """Name Voxel R-CNN's layers; 1 x 1 convolutions over points there are linear layers here."""
+    yield from encoder_names()
+    yield from bev_names(config.depths)
+    yield from head_names()
+    for level in range(len(config.pooling)):
+        for ours, theirs in (("feature", "mlps_in"), ("offset", "mlps_pos"), ("out", "mlps_out")):
+            yield f"roi_pool.levels.{level}.{ours}", f"roi_head.roi_grid_pool_layers.{level}.{theirs}.0.0"
+            yield f"roi_pool.levels.{level}.{ours}_norm", f"roi_head.roi_grid_pool_layers.{level}.{theirs}.0.1"
+    for ours, theirs in (
+        ("shared", "shared_fc_layer"),
+        ("cls_layers", "cls_fc_layers"),
+        ("box_layers", "reg_fc_layers"),
+    ):
+        for layer in (0, 1, 4, 5):
+            yield f"roi_head.{ours}.{layer}", f"roi_head.{theirs}.{layer}"
+    yield "roi_head.cls", "roi_head.cls_pred_layer"
+    yield "roi_head.box", "roi_head.reg_pred_layer"
 
 
 def encoder_names() -> Names:
@@ -90,7 +114,12 @@ def pointpillars_config(classes: int) -> PointPillarsConfig | None:
 
 def second_config(classes: int) -> SecondConfig | None:
     """Return the toolbox's configuration for so many classes."""
-    return {1: KITTI_CAR, 3: SecondConfig(), 5: ONCE}.get(classes)
+    return {1: KITTI_CAR, 3: SecondConfig(), 5: SECOND_ONCE}.get(classes)
+
+
+def voxel_rcnn_config(classes: int) -> VoxelRcnnConfig | None:
+    """Return the toolbox's configuration for cars, and ours for more classes."""
+    return {1: VoxelRcnnConfig(), 3: VOXEL_RCNN_KITTI, 5: VOXEL_RCNN_ONCE}.get(classes)
 
 
 @dataclass(frozen=True)
@@ -103,6 +132,7 @@ class _Model:
 MODELS = {
     "pointpillars": _Model(pointpillars_config, pointpillars, pointpillars_names),
     "second": _Model(second_config, second, second_names),
+    "voxel_rcnn": _Model(voxel_rcnn_config, voxel_rcnn, voxel_rcnn_names),
 }
 """Detectors that can be filled from a checkpoint."""
 

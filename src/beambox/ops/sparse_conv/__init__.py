@@ -9,7 +9,7 @@ from torch import Tensor
 from beambox.checks import BeamboxError, expect_shape
 from beambox.ops.dispatch import Backend, always, can_run_numba, choose
 from beambox.ops.sparse_conv import reference
-from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple
+from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple, linear_keys
 from beambox.ops.sparse_conv.tensor import SparseTensor
 
 __all__ = [
@@ -17,8 +17,10 @@ __all__ = [
     "KernelMap",
     "Sites",
     "SparseTensor",
+    "Triple",
     "inverse_conv3d",
     "kernel_map",
+    "linear_keys",
     "sparse_conv3d",
     "submanifold_conv3d",
 ]

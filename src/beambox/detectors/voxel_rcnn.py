@@ -1,0 +1,240 @@
+"""Voxel R-CNN: towards high performance voxel-based 3D object detection (Deng et al., AAAI 2021).
+
+The first stage is SECOND with a narrower BEV backbone; the second gathers the sparse encoder's features around a
+lattice of points in each proposed box and refines it::
+
+    points -> voxels -> mean -> sparse 3-D encoder -> BEV map -> BEV backbone -> anchor head -> proposals
+                                  |  |  stride 8                 256 ch          stride 8          |
+                          stride 2|  |4 .. 8                                                       v
+                                  +--+-----------------------------------------------> voxel RoI pooling -> RoI head
+                                                                                       6 x 6 x 6 points     score, box
+
+Configuration and numbers are those of the public toolbox's configuration for cars (OpenPCDet, ``voxel_rcnn_car.yaml``),
+whose outputs, of both stages, are reproduced in evaluation mode from its checkpoints.
+
+Deviations: features come from strides 2, 4 and 8 with one radius each, as in the toolbox (the paper's own code: strides
+4 and 8 with two radii each); proposals are never padded to a fixed number; one limit of voxels holds in training and at
+test (the toolbox keeps 16000 in training). The voxel query's range is (z, y, x); for voxels of 0.1 m it is (2, 3, 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from beambox.checks import BeamboxError, expect_same_length
+from beambox.detectors.contract import detections_from
+from beambox.detectors.second import KITTI_VOXELS, ONCE_VOXELS, STRIDE
+from beambox.geometry.grid import VoxelGrid
+from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass, AnchorGrid
+from beambox.layers.bev import BevBackbone
+from beambox.layers.encoders import VoxelEncoder, mean_voxels
+from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss
+from beambox.layers.roi import (
+    ProposalLimits,
+    Rois,
+    RoiSampling,
+    decode_rois,
+    propose,
+    roi_loss,
+    sample_rois,
+    select_rois,
+)
+from beambox.layers.roi_pool import PoolLevel, RoiHead, RoiPredictions, VoxelRoiPool
+from beambox.ops.sparse_conv import SparseTensor
+from beambox.ops.voxelize import Voxels, voxelize
+from beambox.structures.batch import Batch
+from beambox.structures.detections import Detections
+from beambox.structures.labels import Labels
+
+__all__ = ["KITTI", "ONCE", "VoxelRcnn", "VoxelRcnnConfig", "VoxelRcnnPredictions", "voxel_rcnn"]
+
+FINE_POOLING = tuple(PoolLevel(stride, (4, 4, 4), radius) for stride, radius in ((2, 0.4), (4, 0.8), (8, 1.6)))
+"""Voxel RoI pooling for voxels of 0.05 m (toolbox)."""
+COARSE_POOLING = tuple(PoolLevel(stride, (2, 3, 3), radius) for stride, radius in ((2, 0.4), (4, 0.8), (8, 1.6)))
+"""Voxel RoI pooling for voxels of 0.1 m."""
+
+
+@dataclass(frozen=True)
+class VoxelRcnnConfig:
+    """Everything that defines the network; the defaults are the published KITTI setting for cars."""
+
+    anchors: tuple[AnchorClass, ...] = KITTI_ANCHORS[:1]
+    """One anchor shape a class; also the classes and their order."""
+    grid: VoxelGrid = KITTI_VOXELS
+    """Region and voxel size in metres (Voxel R-CNN, section 4.1)."""
+    max_points: int = 5
+    """Points kept in a voxel, in scan order (toolbox)."""
+    max_voxels: int | None = 40000
+    """Voxels kept in a sweep, in order of first appearance; None keeps all (toolbox, at test)."""
+    columns: int = 4
+    """Values of a point: x, y, z, intensity, ..."""
+    encoder_widths: tuple[int, int, int, int] = (16, 32, 64, 64)
+    """Channels of the sparse encoder's stages (Voxel R-CNN, section 3.3)."""
+    encoder_out: int = 128
+    """Channels of one height level of the map (toolbox)."""
+    depths: tuple[int, ...] = (5, 5)
+    """Convolutions of each BEV stage after its first (Voxel R-CNN, section 3.3)."""
+    strides: tuple[int, ...] = (1, 2)
+    """Stride of each BEV stage's first convolution."""
+    widths: tuple[int, ...] = (64, 128)
+    """Channels of each BEV stage."""
+    up_strides: tuple[int, ...] = (1, 2)
+    """Enlargement of each BEV stage's output, to the size of the first."""
+    up_widths: tuple[int, ...] = (128, 128)
+    """Channels of each enlarged output."""
+    centred_anchors: bool = False
+    """Whether anchors stand at the centres of the map's cells."""
+    loss: LossWeights = field(default_factory=LossWeights)
+    """Weights of the first stage's losses; those of the second weigh 1."""
+    smooth_l1_beta: float = 1 / 9
+    """Where the first stage's regression loss turns linear (toolbox)."""
+    train_proposals: ProposalLimits = field(default_factory=lambda: ProposalLimits(9000, 512, 0.8))
+    """Proposals in training (Voxel R-CNN, section 4.1; toolbox)."""
+    test_proposals: ProposalLimits = field(default_factory=lambda: ProposalLimits(2048, 100, 0.7))
+    """Proposals at test (Voxel R-CNN, section 4.1; toolbox)."""
+    sampling: RoiSampling = field(default_factory=RoiSampling)
+    """Regions that the second stage learns from (Voxel R-CNN, section 3.4)."""
+    pooling: tuple[PoolLevel, ...] = FINE_POOLING
+    """Levels of voxel RoI pooling, of strides 2, 4 and 8."""
+    lattice: int = 6
+    """Grid points along each edge of a region (Voxel R-CNN, section 4.1)."""
+    roi_width: int = 256
+    """Width of the second stage's fully connected layers (toolbox)."""
+    dropout: float = 0.3
+    """Share of values dropped in the second stage in training (toolbox)."""
+    post: PostProcess = field(default_factory=lambda: PostProcess(score_threshold=0.3, nms_iou=0.1))
+    """Post-processing at test time (toolbox; the paper: overlap up to 0.1)."""
+
+    def __post_init__(self) -> None:
+        if not self.anchors:
+            raise BeamboxError("`anchors` must name at least one class, got none")
+        strides = [level.stride for level in self.pooling]
+        if not strides or not {2, 4, 8}.issuperset(strides):
+            raise BeamboxError(f"`pooling` must name levels of stride 2, 4 or 8, got strides {strides}")
+        expect_same_length(
+            depths=len(self.depths),
+            strides=len(self.strides),
+            widths=len(self.widths),
+            up_strides=len(self.up_strides),
+            up_widths=len(self.up_widths),
+        )
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes."""
+        return tuple(anchor.name for anchor in self.anchors)
+
+
+KITTI = VoxelRcnnConfig(anchors=KITTI_ANCHORS)
+"""KITTI, three classes."""
+ONCE = VoxelRcnnConfig(
+    anchors=ONCE_ANCHORS,
+    grid=ONCE_VOXELS,
+    max_voxels=60000,
+    test_proposals=ProposalLimits(1024, 100, 0.7),
+    pooling=COARSE_POOLING,
+    post=PostProcess(score_threshold=0.1, nms_iou=0.01),
+)
+"""ONCE, five classes: no public configuration; thresholds of the toolbox's PV-RCNN on ONCE."""
+
+
+@dataclass(frozen=True)
+class VoxelRcnnPredictions:
+    """Outputs of both stages."""
+
+    first: AnchorPredictions
+    """The first stage's anchors."""
+    rois: Rois
+    """Its proposals."""
+    levels: tuple[SparseTensor, ...]
+    """The sparse encoder's features, one for each level of the pooling."""
+    refined: RoiPredictions | None
+    """The second stage's view of the proposals; None in training, where the loss chooses the regions to look at."""
+
+
+class VoxelRcnn(nn.Module):
+    """The network; see :class:`VoxelRcnnConfig`.
+
+    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`VoxelRcnnPredictions`.
+    """
+
+    def __init__(self, config: VoxelRcnnConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE * config.strides[0], config.centred_anchors)
+        self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
+        self.backbone = BevBackbone(
+            self.encoder.bev_channels(config.grid.shape[0]),
+            config.depths,
+            config.strides,
+            config.widths,
+            config.up_strides,
+            config.up_widths,
+        )
+        self.head = AnchorHead(self.backbone.out_channels, self.anchors)
+        channels = dict(zip((2, 4, 8), self.encoder.stage_channels))
+        self.roi_pool = VoxelRoiPool(
+            [channels[level.stride] for level in config.pooling], config.pooling, config.lattice
+        )
+        self.roi_head = RoiHead(self.roi_pool.out_channels, config.roi_width, config.dropout)
+
+    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+        grid = self.config.grid if grid is None else grid
+        voxels = mean_voxels(self.voxels(batch, grid))  # (V, columns)
+        stages = self.encoder(voxels)
+        bev = self.backbone(stages.bev)  # (B, 256, ny / 8, nx / 8)
+        first = self.head(bev, grid)
+        rois = propose(first, self.config.train_proposals if self.training else self.config.test_proposals)
+        by_stride = {2: stages.stride2, 4: stages.stride4, 8: stages.stride8}
+        levels = tuple(by_stride[level.stride] for level in self.config.pooling)
+        refined = None if self.training else self.refine(rois, levels, grid)
+        return VoxelRcnnPredictions(first, rois, levels, refined)
+
+    def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
+        """Gather points into voxels."""
+        config = self.config
+        points = batch.points[:, : config.columns]
+        return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
+
+    def refine(self, rois: Rois, levels: Sequence[SparseTensor], grid: VoxelGrid) -> RoiPredictions:
+        """Run the second stage on any regions."""
+        pooled = self.roi_pool(rois, levels, grid)  # (R, 6 * 6 * 6 * 96)
+        return self.roi_head(pooled)
+
+    def loss(
+        self, predictions: VoxelRcnnPredictions, labels: Sequence[Labels], generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Return the first stage's weighted losses and the second's ``roi_cls``, ``roi_box`` and ``roi_corner``.
+
+        Args:
+            predictions: of this network.
+            labels: ground truth of each sample; objects of other classes are background.
+            generator: source of randomness for drawing regions; PyTorch's default one where None.
+        """
+        first = predictions.first
+        device = first.cls.device
+        known = [of_sample.of_classes(self.config.classes) for of_sample in labels]
+        boxes = [of_sample.boxes.to(device) for of_sample in known]
+        classes = [of_sample.class_index(self.config.classes).to(device) for of_sample in known]
+        losses = anchor_loss(first, boxes, classes, self.anchors, self.config.loss, self.config.smooth_l1_beta)
+        targets = sample_rois(predictions.rois, boxes, classes, self.config.sampling, generator)
+        refined = self.refine(targets.rois, predictions.levels, first.grid)
+        return {**losses, **roi_loss(refined.cls, refined.codes, targets)}
+
+    def decode(self, predictions: VoxelRcnnPredictions) -> list[Detections]:
+        """Return the detections of each sample, best first."""
+        rois, refined = predictions.rois, predictions.refined
+        if refined is None:
+            refined = self.refine(rois, predictions.levels, predictions.first.grid)
+        boxes = decode_rois(refined.codes.float(), rois.boxes)
+        return detections_from(select_rois(rois, refined.cls, boxes, self.config.post), self.config.classes)
+
+
+def voxel_rcnn(config: VoxelRcnnConfig | None = None) -> VoxelRcnn:
+    """Build Voxel R-CNN; without a configuration, the published one for KITTI's cars (7.6 M parameters)."""
+    return VoxelRcnn(config or VoxelRcnnConfig())

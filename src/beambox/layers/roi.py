@@ -1,0 +1,272 @@
+"""Regions of interest: proposals, what they are taught, their refinement (Voxel R-CNN, section 3.3; PV-RCNN, 3.4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from beambox.geometry.boxes import corners_3d, local_to_world, rotate_z, wrap_angle
+from beambox.layers.coders import decode_boxes, encode_boxes
+from beambox.layers.heads import AnchorPredictions, PostProcess
+from beambox.layers.losses import smooth_l1
+from beambox.ops.nms import nms
+from beambox.ops.rotated_iou import iou_3d
+
+__all__ = [
+    "ProposalLimits",
+    "RoiSampling",
+    "RoiTargets",
+    "Rois",
+    "canonical_targets",
+    "corner_loss",
+    "decode_rois",
+    "overlap_score",
+    "propose",
+    "roi_loss",
+    "sample_rois",
+    "select_rois",
+]
+
+
+@dataclass(frozen=True)
+class ProposalLimits:
+    """How many of the first stage's boxes go on to the second."""
+
+    pre: int
+    """Best boxes that enter the suppression."""
+    post: int
+    """Boxes kept at most."""
+    iou: float
+    """Overlap (bird's-eye view) above which the lower-scored of two boxes is dropped."""
+
+
+@dataclass(frozen=True)
+class Rois:
+    """Regions of interest of a batch, sample after sample; R in all, never padded."""
+
+    boxes: Tensor
+    """``(R, 7)``."""
+    labels: Tensor
+    """``(R,)`` int64 position of the class."""
+    sample: Tensor
+    """``(R,)`` int64, ascending."""
+    batch_size: int
+    """Number of samples; some may have no region."""
+
+
+@dataclass(frozen=True)
+class RoiSampling:
+    """Which proposals the second stage is taught on, and what (PV-RCNN, section 3.4)."""
+
+    per_sample: int = 128
+    """Regions drawn from each sample."""
+    positive_share: float = 0.5
+    """Share of positive ones at most."""
+    positive_iou: float = 0.55
+    """Overlap (3-D, with an object of the predicted class) from which a region is positive and regresses."""
+    easy_iou: float = 0.1
+    """Overlap below which a negative region is easy."""
+    hard_share: float = 0.8
+    """Share of hard ones among the negatives."""
+    score_low: float = 0.25
+    """Overlap at which the taught score is 0."""
+    score_high: float = 0.75
+    """Overlap at which the taught score is 1."""
+
+
+@dataclass(frozen=True)
+class RoiTargets:
+    """Sampled regions and what they are taught."""
+
+    rois: Rois
+    """R sampled regions."""
+    boxes: Tensor
+    """``(R, 7)`` the object each overlaps most; any where it overlaps none."""
+    iou: Tensor
+    """``(R,)`` that overlap."""
+    score: Tensor
+    """``(R,)`` the score to learn, in [0, 1]."""
+    regress: Tensor
+    """``(R,)`` bool: whether the box is to be learnt."""
+
+
+def propose(predictions: AnchorPredictions, limits: ProposalLimits) -> Rois:
+    """Take each sample's best decoded boxes through a class-agnostic suppression; no gradient."""
+    with torch.no_grad():
+        decoded = predictions.decoded()
+        score, label = predictions.cls.float().max(dim=-1)  # (B, N); the sigmoid would not change the order
+        kept = [nms(boxes, s, limits.iou, limits.pre, limits.post) for boxes, s in zip(decoded, score)]
+        counts = torch.tensor([len(rows) for rows in kept], device=score.device)
+        return Rois(
+            torch.cat([boxes[rows] for boxes, rows in zip(decoded, kept)]),
+            torch.cat([of_sample[rows] for of_sample, rows in zip(label, kept)]),
+            torch.repeat_interleave(torch.arange(len(kept), device=score.device), counts),
+            len(kept),
+        )
+
+
+def sample_rois(
+    rois: Rois,
+    boxes: Sequence[Tensor],
+    classes: Sequence[Tensor],
+    options: RoiSampling,
+    generator: torch.Generator | None = None,
+) -> RoiTargets:
+    """Draw the regions to learn from; no gradient.
+
+    Args:
+        rois: proposals.
+        boxes: for each sample ``(M, 7)`` objects.
+        classes: for each sample ``(M,)`` int64 position of each object's class.
+        options: numbers and thresholds.
+        generator: source of randomness (on the CPU); PyTorch's default one, which trainers seed, where None.
+    """
+    chosen, matched, overlaps = [], [], []
+    with torch.no_grad():
+        for sample in range(rois.batch_size):
+            rows = torch.nonzero(rois.sample == sample)[:, 0]
+            if len(rows) == 0:
+                continue
+            iou, best = _best_overlap(rois.boxes[rows], rois.labels[rows], boxes[sample], classes[sample])
+            drawn = _draw(iou.cpu(), options, generator).to(rows.device)
+            objects = boxes[sample].to(rois.boxes)
+            chosen.append(rows[drawn])
+            overlaps.append(iou[drawn])
+            matched.append(objects[best[drawn]] if len(objects) else rois.boxes[rows[drawn]])
+        if not chosen:
+            nothing = rois.boxes.new_zeros(0)
+            return RoiTargets(rois, rois.boxes, nothing, nothing, nothing.bool())
+        row, iou = torch.cat(chosen), torch.cat(overlaps)
+        picked = Rois(rois.boxes[row], rois.labels[row], rois.sample[row], rois.batch_size)
+        return RoiTargets(picked, torch.cat(matched), iou, overlap_score(iou, options), iou > options.positive_iou)
+
+
+def _best_overlap(rois: Tensor, labels: Tensor, boxes: Tensor, classes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return each region's largest overlap with an object of its class, and that object."""
+    if len(boxes) == 0:
+        return rois.new_zeros(len(rois)), labels.new_zeros(len(rois))
+    iou = iou_3d(rois, boxes.to(rois))  # (R, M)
+    iou = torch.where(labels[:, None] == classes.to(labels.device)[None], iou, 0.0)
+    value, best = iou.max(dim=1)
+    return value, best
+
+
+def _draw(iou: Tensor, options: RoiSampling, generator: torch.Generator | None) -> Tensor:
+    """Draw rows: positives without repetition, negatives with, hard ones first."""
+    total = options.per_sample
+    positive = torch.nonzero(iou >= options.positive_iou)[:, 0]
+    hard = torch.nonzero((iou < options.positive_iou) & (iou >= options.easy_iou))[:, 0]
+    easy = torch.nonzero(iou < options.easy_iou)[:, 0]
+
+    def repeated(rows: Tensor, count: int) -> Tensor:
+        return rows[torch.randint(len(rows), (count,), generator=generator)]
+
+    if len(hard) + len(easy) == 0:
+        return repeated(positive, total)
+    wanted = min(round(total * options.positive_share), len(positive))
+    first = positive[torch.randperm(len(positive), generator=generator)[:wanted]]
+    negatives = total - wanted
+    if len(hard) == 0:
+        return torch.cat((first, repeated(easy, negatives)))
+    if len(easy) == 0:
+        return torch.cat((first, repeated(hard, negatives)))
+    of_hard = min(int(options.hard_share * negatives), len(hard))
+    return torch.cat((first, repeated(hard, of_hard), repeated(easy, negatives - of_hard)))
+
+
+def overlap_score(iou: Tensor, options: RoiSampling) -> Tensor:
+    """Return the score to learn: 0 up to ``score_low``, 1 from ``score_high`` on, linear between."""
+    return ((iou - options.score_low) / (options.score_high - options.score_low)).clamp(0, 1)
+
+
+def canonical_targets(boxes: Tensor, rois: Tensor) -> Tensor:
+    """Express objects in the frames of their regions, as box codes to regress.
+
+    The heading is taken relative to the region's and folded into [-pi / 2, pi / 2]: the second stage refines a
+    heading and does not tell front from rear.
+
+    Args:
+        boxes: ``(R, 7)``.
+        rois: ``(R, 7)``.
+
+    Returns:
+        ``(R, 7)`` codes relative to a box at the origin with the region's sizes.
+    """
+    centre = rotate_z(boxes[:, :3] - rois[:, :3], -rois[:, 6])
+    turn = wrap_angle(boxes[:, 6] - rois[:, 6], 0.0)  # [0, 2 pi)
+    opposite = (turn > math.pi / 2) & (turn < 1.5 * math.pi)
+    turn = wrap_angle(torch.where(opposite, turn + math.pi, turn)).clamp(-math.pi / 2, math.pi / 2)
+    local = torch.cat((centre, boxes[:, 3:6], turn[:, None]), dim=1)
+    return encode_boxes(local, _at_origin(rois))
+
+
+def decode_rois(codes: Tensor, rois: Tensor) -> Tensor:
+    """Inverse of :func:`canonical_targets`: ``(R, 7)`` boxes in the world, headings in [-pi, pi)."""
+    local = decode_boxes(codes, _at_origin(rois))
+    centre = local_to_world(local[:, None, :3], rois)[:, 0]
+    return torch.cat((centre, local[:, 3:6], wrap_angle(local[:, 6:] + rois[:, 6:7])), dim=1)
+
+
+def _at_origin(rois: Tensor) -> Tensor:
+    zeros = torch.zeros_like(rois[:, :1])
+    return torch.cat((zeros, zeros, zeros, rois[:, 3:6], zeros), dim=1)
+
+
+def corner_loss(predicted: Tensor, boxes: Tensor) -> Tensor:
+    """Return the mean distance loss of eight corners, the object taken either way round: ``(R, 7)`` -> ``(R,)``."""
+    turned = torch.cat((boxes[:, :6], boxes[:, 6:] + math.pi), dim=1)
+    corners = corners_3d(predicted)
+    distance = torch.minimum(
+        torch.linalg.vector_norm(corners - corners_3d(boxes), dim=2),
+        torch.linalg.vector_norm(corners - corners_3d(turned), dim=2),
+    )  # (R, 8)
+    return smooth_l1(distance, 1.0).mean(dim=1)
+
+
+def roi_loss(cls: Tensor, codes: Tensor, targets: RoiTargets) -> dict[str, Tensor]:
+    """Compute the second stage's losses, all of weight 1.
+
+    Args:
+        cls: ``(R,)`` logits.
+        codes: ``(R, 7)`` box codes.
+        targets: of the same regions.
+
+    Returns:
+        Scalars ``roi_cls`` (mean over regions), ``roi_box`` and ``roi_corner`` (mean over regions that regress).
+    """
+    cls, codes = cls.float(), codes.float()
+    classified = functional.binary_cross_entropy_with_logits(cls, targets.score, reduction="sum") / max(1, len(cls))
+    regress = targets.regress
+    reach = 0.0 * codes.sum()  # keeps every parameter in the graph where nothing regresses
+    if not bool(regress.any()):
+        return {"roi_cls": classified, "roi_box": reach, "roi_corner": reach}
+    rois, boxes, codes = targets.rois.boxes[regress], targets.boxes[regress], codes[regress]
+    box = smooth_l1(codes - canonical_targets(boxes, rois)).sum() / len(rois)
+    corner = corner_loss(decode_rois(codes, rois), boxes).mean()
+    return {"roi_cls": classified, "roi_box": box, "roi_corner": corner}
+
+
+def select_rois(rois: Rois, cls: Tensor, boxes: Tensor, options: PostProcess) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Keep the good refined boxes of each sample: threshold, class-agnostic rotated suppression.
+
+    Args:
+        rois: regions.
+        cls: ``(R,)`` logits.
+        boxes: ``(R, 7)`` refined boxes.
+        options: thresholds.
+
+    Returns:
+        For each sample boxes ``(M, 7)``, scores ``(M,)`` and class positions ``(M,)``, best first.
+    """
+    kept = []
+    score = torch.sigmoid(cls.float())
+    for sample in range(rois.batch_size):
+        row = torch.nonzero((rois.sample == sample) & (score >= options.score_threshold))[:, 0]
+        row = row[nms(boxes[row], score[row], options.nms_iou, options.nms_pre, options.nms_post)]
+        kept.append((boxes[row], score[row], rois.labels[row]))
+    return kept

@@ -1,0 +1,161 @@
+"""Voxel RoI pooling and the head on top of it (Voxel R-CNN, sections 3.2 and 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from beambox.geometry.boxes import local_to_world
+from beambox.geometry.grid import VoxelGrid
+from beambox.layers.roi import Rois
+from beambox.ops.sparse_conv import SparseTensor
+from beambox.ops.voxel_query import voxel_query
+
+__all__ = ["PoolLevel", "RoiHead", "RoiPredictions", "VoxelRoiPool"]
+
+
+@dataclass(frozen=True)
+class PoolLevel:
+    """How features of one stride are gathered around a region's grid points."""
+
+    stride: int
+    """Voxels across a cell of this level."""
+    reach: tuple[int, int, int]
+    """Cells looked at on both sides (z, y, x)."""
+    radius: float
+    """Largest distance from grid point to cell centre, metres."""
+    samples: int = 16
+    """Cells gathered at most."""
+    channels: int = 32
+    """Width of the gathered features."""
+
+
+class _Gather(nn.Module):
+    """One level: features and offsets of the cells around each grid point, added, and the maximum kept.
+
+    The published code writes these layers as 1 x 1 convolutions.
+    """
+
+    def __init__(self, in_channels: int, level: PoolLevel) -> None:
+        super().__init__()
+        self.level = level
+        self.feature = nn.Linear(in_channels, level.channels, bias=False)
+        self.feature_norm = nn.BatchNorm1d(level.channels)
+        self.offset = nn.Linear(3, level.channels, bias=False)
+        self.offset_norm = nn.BatchNorm1d(level.channels)
+        self.out = nn.Linear(level.channels, level.channels, bias=False)
+        self.out_norm = nn.BatchNorm1d(level.channels)
+        for linear in (self.feature, self.offset, self.out):
+            nn.init.kaiming_normal_(linear.weight)
+
+    def forward(self, points: Tensor, cells: Tensor, cell_features: SparseTensor, grid: VoxelGrid) -> Tensor:
+        """Describe ``(M, 3)`` points in cells ``(M, 4)`` of full resolution: ``(M, channels)``."""
+        level, sites = self.level, cell_features.sites
+        size = torch.tensor(grid.cell, device=points.device) * level.stride
+        minimum = torch.tensor(grid.minimum, device=points.device)
+        centres = (sites.indices[:, 1:].flip(1) + 0.5) * size + minimum  # (V, 3)
+        own = torch.cat((cells[:, :1], torch.div(cells[:, 1:], level.stride, rounding_mode="floor")), dim=1)
+        found = voxel_query(points, own, sites, centres, level.reach, level.radius, level.samples)  # (M, S)
+        none = found[:, :1] < 0
+        features = _normed(self.feature(cell_features.features.to(points.dtype)), self.feature_norm)  # (V, C)
+        row = found.clamp(min=0)
+        if len(features) == 0:
+            features, centres = features.new_zeros((1, level.channels)), centres.new_zeros((1, 3))
+        gathered = torch.where(none[..., None], 0.0, features[row])  # (M, S, C)
+        away = torch.where(none[..., None], 0.0, centres[row] - points[:, None])  # (M, S, 3)
+        position = _normed(self.offset(away).flatten(0, 1), self.offset_norm).unflatten(0, found.shape)
+        pooled = functional.relu((gathered + position).amax(dim=1))  # (M, C); ReLU and maximum commute
+        return functional.relu(_normed(self.out(pooled), self.out_norm))
+
+
+def _normed(values: Tensor, norm: nn.BatchNorm1d) -> Tensor:
+    """Normalise rows; by the running statistics where there are too few for statistics of their own."""
+    training = norm.training and len(values) > 1
+    if training:
+        return norm(values)
+    return functional.batch_norm(
+        values, norm.running_mean, norm.running_var, norm.weight, norm.bias, training=False, eps=norm.eps
+    )
+
+
+class VoxelRoiPool(nn.Module):
+    """Describe each region by features gathered at a lattice of points in it, from several levels."""
+
+    def __init__(self, in_channels: Sequence[int], levels: Sequence[PoolLevel], lattice: int = 6) -> None:
+        super().__init__()
+        self.lattice = lattice
+        self.levels = nn.ModuleList(
+            _Gather(channels, level) for channels, level in zip(in_channels, levels, strict=True)
+        )
+        self.out_channels = lattice**3 * sum(level.channels for level in levels)
+
+    def grid_points(self, boxes: Tensor) -> Tensor:
+        """Return ``lattice ** 3`` points in each box, evenly spread, z fastest: ``(R, 7)`` -> ``(R, G, 3)``."""
+        steps = (torch.arange(self.lattice, device=boxes.device) + 0.5) / self.lattice - 0.5
+        local = torch.cartesian_prod(steps, steps, steps)  # (G, 3)
+        return local_to_world(local * boxes[:, None, 3:6], boxes)
+
+    def forward(self, rois: Rois, levels: Sequence[SparseTensor], grid: VoxelGrid) -> Tensor:
+        """Pool the levels at the regions: ``(R, out_channels)``, grid point after grid point."""
+        points = self.grid_points(rois.boxes.detach()).flatten(0, 1)  # (R * G, 3)
+        minimum = torch.tensor(grid.minimum, device=points.device)
+        size = torch.tensor(grid.cell, device=points.device)
+        cell = torch.div(points - minimum, size, rounding_mode="floor").long().flip(1)  # (R * G, 3) z, y, x
+        sample = rois.sample.repeat_interleave(self.lattice**3)
+        cells = torch.cat((sample[:, None], cell), dim=1)
+        pooled = [gather(points, cells, level, grid) for gather, level in zip(self.levels, levels, strict=True)]
+        return torch.cat(pooled, dim=1).reshape(len(rois.boxes), self.out_channels)
+
+
+@dataclass(frozen=True)
+class RoiPredictions:
+    """What the second stage says of R regions."""
+
+    cls: Tensor
+    """``(R,)`` logits of the overlap score."""
+    codes: Tensor
+    """``(R, 7)`` box codes in the regions' frames."""
+
+
+class RoiHead(nn.Module):
+    """Two shared fully connected layers, and two for each of score and box."""
+
+    def __init__(self, in_channels: int, width: int = 256, dropout: float = 0.3) -> None:
+        super().__init__()
+        self.shared = _connected(in_channels, width, dropout)
+        self.cls_layers = _connected(width, width, dropout)
+        self.cls = nn.Linear(width, 1)
+        self.box_layers = _connected(width, width, dropout)
+        self.box = nn.Linear(width, 7)
+        nn.init.normal_(self.cls.weight, std=0.01)
+        nn.init.normal_(self.box.weight, std=0.001)
+        nn.init.zeros_(self.cls.bias)
+        nn.init.zeros_(self.box.bias)
+
+    def forward(self, pooled: Tensor) -> RoiPredictions:
+        """Predict from ``(R, in_channels)`` pooled features."""
+        if len(pooled) == 1 and self.training:  # batch statistics need two values: the region counts twice
+            twice = self(pooled.expand(2, -1))
+            return RoiPredictions(twice.cls[:1], twice.codes[:1])
+        shared = self.shared(pooled)
+        return RoiPredictions(self.cls(self.cls_layers(shared))[:, 0], self.box(self.box_layers(shared)))
+
+
+def _connected(in_channels: int, width: int, dropout: float) -> nn.Sequential:
+    layers = nn.Sequential(
+        nn.Linear(in_channels, width, bias=False),
+        nn.BatchNorm1d(width),
+        nn.ReLU(),
+        nn.Dropout(dropout),
+        nn.Linear(width, width, bias=False),
+        nn.BatchNorm1d(width),
+        nn.ReLU(),
+    )
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_normal_(layer.weight)
+    return layers

@@ -1,0 +1,59 @@
+"""Voxel query: the active voxels near a point, found by their indices rather than by distance to all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from beambox.checks import BeamboxError, expect_same_length, expect_shape
+from beambox.ops.dispatch import Backend, always, can_run_numba, choose
+from beambox.ops.sparse_conv import Sites, Triple
+from beambox.ops.voxel_query import reference
+
+__all__ = ["voxel_query"]
+
+
+def _numba() -> Callable[..., Tensor]:
+    from beambox.ops.voxel_query.cpu import voxel_query
+
+    return voxel_query
+
+
+BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.voxel_query))
+
+
+def voxel_query(
+    points: Tensor, cells: Tensor, sites: Sites, centres: Tensor, reach: Triple, radius: float, samples: int
+) -> Tensor:
+    """Find the first active voxels around each point (Voxel R-CNN, section 3.2).
+
+    The cells within ``reach`` of a point's own cell are visited with x fastest, then y, then z; an active one whose
+    centre is no farther than ``radius`` from the point is taken, until there are ``samples``. No gradient.
+
+    Args:
+        points: ``(M, 3)`` x, y, z in metres.
+        cells: ``(M, 4)`` int64 (b, z, y, x) of the cell each point lies in; may lie outside the grid.
+        sites: the active voxels.
+        centres: ``(V, 3)`` x, y, z of the voxels' centres in metres.
+        reach: cells looked at on both sides (z, y, x).
+        radius: metres.
+        samples: number of voxels S.
+
+    Returns:
+        ``(M, S)`` int64 rows of ``sites``; where fewer are found the first is repeated, where none is all are -1.
+
+    Raises:
+        BeamboxError: if a shape does not fit, or a limit is not positive.
+    """
+    expect_shape("points", points, ("M", 3))
+    expect_shape("cells", cells, ("M", 4))
+    expect_shape("centres", centres, (len(sites), 3))
+    expect_same_length(points=len(points), cells=len(cells))
+    if min(reach) < 0 or not radius > 0 or samples < 1:
+        raise BeamboxError(
+            f"a voxel query needs a reach of at least 0, a positive radius and at least 1 sample, "
+            f"got {reach}, {radius} and {samples}"
+        )
+    points, centres = points.detach(), centres.detach().to(points.dtype)
+    return choose("voxel_query", BACKENDS, points, cells)(points, cells, sites, centres, reach, radius, samples)

@@ -1,0 +1,64 @@
+"""Voxel query on the CPU: rows of the grid are found by a table, cells of a row by walking it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.sparse_conv import Sites, Triple
+
+__all__ = ["voxel_query"]
+
+
+def voxel_query(
+    points: Tensor, cells: Tensor, sites: Sites, centres: Tensor, reach: Triple, radius: float, samples: int
+) -> Tensor:
+    """Find the first active voxels around each point; see :func:`beambox.ops.voxel_query.voxel_query`."""
+    found = np.full((len(points), samples), -1, np.int64)
+    if len(sites) == 0 or len(points) == 0:
+        return torch.from_numpy(found)
+    keys, order = sites.sorted_keys.numpy(), sites.order.numpy()
+    line = keys // sites.shape[2]
+    lines = np.zeros(sites.batch_size * sites.shape[0] * sites.shape[1] + 1, np.int64)
+    np.cumsum(np.bincount(line, minlength=len(lines) - 1), out=lines[1:])
+    column = keys - line * sites.shape[2]
+    p, c, m = points.contiguous().numpy(), cells.contiguous().numpy(), centres.contiguous().numpy()
+    extent = np.array((sites.batch_size, *sites.shape))
+    limit = p.dtype.type(radius) ** 2
+    around = np.array(reach)
+    run_in_blocks(
+        lambda first, last: _search(p, c, m, lines, column, order, extent, around, limit, found, first, last),
+        len(points),
+        256,
+    )
+    return torch.from_numpy(found)
+
+
+@jit
+def _search(points, cells, centres, lines, column, order, extent, reach, limit, found, first, last):
+    samples = found.shape[1]
+    for i in range(first, last):
+        b, z, y, x = cells[i]
+        if b < 0 or b >= extent[0]:
+            continue
+        n = 0
+        for cz in range(max(0, z - reach[0]), min(extent[1], z + reach[0] + 1)):
+            for cy in range(max(0, y - reach[1]), min(extent[2], y + reach[1] + 1)):
+                line = (b * extent[1] + cz) * extent[2] + cy
+                at, stop = lines[line], lines[line + 1]
+                if stop - at > 8:
+                    at += np.searchsorted(column[at:stop], x - reach[2])
+                while at < stop and column[at] <= x + reach[2] and n < samples:
+                    if column[at] >= x - reach[2]:
+                        row = order[at]
+                        dx = centres[row, 0] - points[i, 0]
+                        dy = centres[row, 1] - points[i, 1]
+                        dz = centres[row, 2] - points[i, 2]
+                        if dx * dx + dy * dy + dz * dz <= limit:
+                            found[i, n] = row
+                            n += 1
+                    at += 1
+        for rest in range(max(n, 1), samples):
+            found[i, rest] = found[i, 0]
