@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beambox.geometry.boxes import wrap_angle
@@ -39,7 +39,7 @@ def generator(seed=0):
 
 
 def test_sampling_keeps_the_published_shares():
-    offsets = [0.0] * 100 + [2.0] * 50 + [50.0] * 300  # overlaps 1, about 0.3, 0
+    offsets = [0.0] * 100 + [2.0] * 60 + [50.0] * 300  # overlaps 1, about 0.3, 0
     targets = sample_rois(rois_near(CAR, offsets), [CAR[None]], [torch.zeros(1).long()], RoiSampling(), generator())
     assert len(targets.rois.boxes) == 128
     assert int((targets.iou >= 0.55).sum()) == 64
@@ -93,14 +93,14 @@ metre = st.floats(-3, 3)
 size = st.floats(0.5, 5)
 
 
+@settings(deadline=None)
 @given(metre, metre, metre, size, size, size, angle, angle)
 def test_decoding_undoes_the_canonical_targets(x, y, z, length, w, h, yaw, roi_yaw):
     roi = torch.tensor([[8.0, -3.0, -1.0, 4.2, 1.7, 1.4, roi_yaw]], dtype=torch.float64)
     box = torch.tensor([[8.0 + x, -3.0 + y, -1.0 + z, length, w, h, yaw]], dtype=torch.float64)
     decoded = decode_rois(canonical_targets(box, roi), roi)
     torch.testing.assert_close(decoded[:, :6], box[:, :6])
-    half = float(wrap_angle(decoded[0, 6] - box[0, 6], 0.5, math.pi).abs())
-    assert half < 1e-6 or abs(half - math.pi / 2) < 1e-6 or abs(half - math.pi) < 1e-6
+    assert float(wrap_angle(decoded[0, 6] - box[0, 6], 0.5, math.pi).abs()) < 1e-6  # up to a half turn
     assert float(wrap_angle(decoded[0, 6] - roi[0, 6]).abs()) <= math.pi / 2 + 1e-6
 
 

@@ -41,10 +41,10 @@ def level(seed: int, density: float = 0.3):
 
 def test_grid_points_fill_the_box_with_z_fastest(pool):
     points = pool.grid_points(torch.tensor([[1.0, 2.0, 3.0, 3.0, 6.0, 9.0, 0.0]]))[0]
-    assert points[0].tolist() == [0.0, 0.0, 0.0]
-    assert points[1].tolist() == [0.0, 0.0, 3.0]
-    assert points[3].tolist() == [0.0, 2.0, 0.0]
-    assert points[13].tolist() == [1.0, 2.0, 3.0]
+    assert points[0].tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-5)
+    assert points[1].tolist() == pytest.approx([0.0, 0.0, 3.0], abs=1e-5)
+    assert points[3].tolist() == pytest.approx([0.0, 2.0, 0.0], abs=1e-5)
+    assert points[13].tolist() == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_pooling_equals_loops(pool):
