@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from beambox.checks import BeamboxError, expect_same_length
@@ -100,7 +101,8 @@ def prepare_frame(frame: Frame, classes: Sequence[str] | None, grid: VoxelGrid |
         (x0, y0, z0), (x1, y1, z1) = grid.minimum, grid.maximum
         x, y, z = cloud[:, 0], cloud[:, 1], cloud[:, 2]
         # closed, and so a hair wider than the grid's own test, which decides
-        points = points[(x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1)]
+        inside = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1)
+        points = torch.from_numpy(cloud[inside])
     return replace(frame, points=points, labels=labels)
 
 
