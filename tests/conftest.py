@@ -6,6 +6,13 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
+
+# A busy machine is no failure; the same examples everywhere, so that a failure repeats.
+settings.register_profile(
+    "beambox", deadline=None, derandomize=True, max_examples=50, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("beambox")
 
 
 @pytest.fixture(autouse=True, scope="session")
