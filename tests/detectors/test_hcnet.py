@@ -1,12 +1,13 @@
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.kitti import KittiSource
-from beambox.detectors.catalogue import build, config_to_dict
+from beambox.detectors.catalogue import build, config_from_dict, config_to_dict
 from beambox.detectors.hcnet import HCNET_CAR, HCNetConfig, hcnet
 from beambox.detectors.weights import load_weights, save_weights
 from beambox.geometry.grid import VoxelGrid
@@ -14,6 +15,7 @@ from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.layers.attention import Gate, HeightChannelKind, pseudo_images
 from beambox.ops.voxelize import voxelize
 from beambox.structures import Batch, Frame, Labels
+from beambox.train.config import read_recipe
 from oracles.paths import data_dir
 
 SMALL = HCNetConfig(
@@ -89,6 +91,11 @@ def test_the_defaults_are_the_papers_setting() -> None:
     (car,) = config.anchors
     assert (car.size, car.matched, car.unmatched) == ((3.9, 1.6, 1.5), 0.6, 0.45)
     assert (config.loss.loc, config.loss.cls, config.loss.direction) == (2.0, 1.0, 0.2)
+
+
+def test_the_papers_recipe_is_the_defaults() -> None:
+    recipe = read_recipe(Path(__file__).resolve().parents[2] / "recipes" / "hcnet_kitti_car.yaml")
+    assert config_from_dict(HCNetConfig, recipe.detector.options) == HCNetConfig()
 
 
 def test_the_network_merges_pseudo_images_as_the_paper_writes_it() -> None:

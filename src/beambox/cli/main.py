@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
+    "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
     "score": ("beambox.cli.score:app", "score result files of any detector by the rules of KITTI or ONCE"),
 }
 

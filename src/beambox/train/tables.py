@@ -1,0 +1,148 @@
+"""The tables that `beambox ablate` trains again, as data: switches and published numbers of each row.
+
+Switches are options of the detector on top of the recipe's; a row without them is quoted from the paper, not trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from beambox.checks import BeamboxError, did_you_mean
+
+__all__ = ["TABLES", "Column", "Row", "Table", "levels", "table_of"]
+
+LEVELS = ("easy", "moderate", "hard")
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number of every row."""
+
+    group: str
+    """Metric with its protocol, such as ``Car 3-D R11``."""
+    name: str
+    """Its part, such as ``moderate``."""
+    path: tuple[str | int, ...]
+    """Where the number stands in what scoring gives (``to_json()``), such as ``("Car", "3d", "R11", 1)``."""
+
+
+def levels(name: str, metric: str, recalls: str) -> tuple[Column, ...]:
+    """Return KITTI's three columns of a class: easy, moderate, hard.
+
+    Args:
+        name: of the class.
+        metric: ``3d``, ``bev``, ``2d`` or ``aos``.
+        recalls: ``R11`` or ``R40``.
+    """
+    title = {"3d": "3-D", "bev": "BEV", "2d": "2-D", "aos": "AOS"}[metric]
+    return tuple(
+        Column(f"{name} {title} {recalls}", level, (name, metric, recalls, i)) for i, level in enumerate(LEVELS)
+    )
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table."""
+
+    name: str
+    """As the paper calls it."""
+    published: tuple[float | None, ...]
+    """The paper's number of each column; None where it has none."""
+    options: Mapping[str, Any] | None = None
+    """Switches: what the detector's options are beyond the recipe's. None for a row that is quoted and not trained."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a paper."""
+
+    title: str
+    """Paper, number and what is compared."""
+    protocol: str
+    """What the paper's numbers were measured on."""
+    recipe: str
+    """Recipe of every row, a file of ``recipes/`` without its ending."""
+    columns: tuple[Column, ...]
+    """What is measured."""
+    rows: tuple[Row, ...]
+    """In the paper's order."""
+    remarks: tuple[str, ...] = ()
+    """What a reader of the paper's numbers should know."""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            assert len(row.published) == len(self.columns), f"{self.title}, {row.name}: a number for each column"
+
+
+CAR_3D_R11 = levels("Car", "3d", "R11")
+HCNET_VAL = "KITTI validation split, cars, IoU 0.7; R11 is not stated, but the baselines it copies are R11"
+
+TABLES: dict[str, Table] = {
+    "hcnet-table1": Table(
+        title="HCNet, table 1: 3-D detection on the validation split",
+        protocol=HCNET_VAL,
+        recipe="hcnet_kitti_car",
+        columns=CAR_3D_R11,
+        rows=(
+            Row("VoxelNet", (81.97, 65.46, 62.85)),
+            Row("SECOND", (85.50, 75.04, 68.78)),
+            Row("PointPillars", (87.50, 77.01, 74.77)),
+            Row("PointRCNN", (88.26, 77.73, 76.67)),
+            Row("HCNet", (88.45, 78.01, 76.72), {}),
+        ),
+    ),
+    "hcnet-table2": Table(
+        title="HCNet, table 2: from above, in 3-D, and orientation",
+        protocol="KITTI test server, cars, IoU 0.7; HCNet's own row (late 2021) is R40, the others are older, R11",
+        recipe="hcnet_kitti_car",
+        columns=(*levels("Car", "bev", "R40"), *levels("Car", "3d", "R40"), *levels("Car", "aos", "R40")),
+        rows=(
+            Row("VoxelNet", (89.35, 79.26, 77.39, 77.47, 65.11, 57.73, None, None, None)),
+            Row("SECOND", (88.07, 79.37, 77.95, 83.13, 73.66, 66.20, 87.84, 81.31, 71.85)),
+            Row("PointPillars", (88.35, 86.10, 79.83, 79.05, 74.99, 68.30, 90.19, 88.76, 86.38)),
+            Row("PointRCNN", (89.28, 86.04, 79.02, 84.32, 75.42, 67.86, 90.76, 89.55, 80.76)),
+            Row("SARPNET", (88.93, 87.26, 78.68, 84.92, 75.64, 67.70, 90.16, 88.86, 80.05)),
+            Row("HCNet", (90.27, 86.91, 81.90, 81.31, 73.56, 68.42, 95.05, 91.44, 88.02), {}),
+        ),
+        remarks=("AOS is bounded by the AP in the image, not by the one from above",),
+    ),
+    "hcnet-table3": Table(
+        title="HCNet, table 3: which attention weighs the pseudo images",
+        protocol=HCNET_VAL,
+        recipe="hcnet_kitti_car",
+        columns=CAR_3D_R11,
+        rows=(
+            Row("none", (None, None, None), {"attention": "none"}),
+            Row("CA", (87.22, 77.33, 75.78), {"attention": "CA"}),
+            Row("HA", (87.19, 77.26, 75.82), {"attention": "HA"}),
+            Row("HCA", (88.45, 78.01, 76.72), {}),
+        ),
+        remarks=("`none`, a plain maximum over the slices, is not in the paper",),
+    ),
+    "hcnet-table4": Table(
+        title="HCNet, table 4: parts of the head",
+        protocol=HCNET_VAL,
+        recipe="hcnet_kitti_car",
+        columns=CAR_3D_R11,
+        rows=(
+            Row("neither", (None, None, None), {"oifm": False, "aam": False}),
+            Row("AAM", (87.23, 77.33, 75.70), {"oifm": False}),
+            Row("OIFM", (88.32, 78.08, 76.52), {"aam": False}),
+            Row("AAM + OIFM", (88.45, 78.01, 76.72), {}),
+        ),
+        remarks=("`neither` is not in the paper",),
+    ),
+}
+
+
+def table_of(name: str) -> Table:
+    """Look a table up.
+
+    Raises:
+        BeamboxError: naming the nearest one.
+    """
+    if name not in TABLES:
+        raise BeamboxError(f'there is no table "{name}"{did_you_mean(name, TABLES)}')
+    return TABLES[name]

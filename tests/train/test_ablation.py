@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer import Typer
+from typer.testing import CliRunner
+
+from beambox.checks import BeamboxError
+from beambox.cli import ablate
+from beambox.data.source import FrameSource
+from beambox.detectors.catalogue import CATALOGUE, config_from_dict
+from beambox.metrics.kitti_result import AveragePrecision, ClassResult, KittiResult
+from beambox.train import ablation
+from beambox.train.ablation import Interrupted, merged, report, row_recipe, run_table, to_json, value_at
+from beambox.train.config import Recipe, parse_recipe, read_recipe
+from beambox.train.tables import TABLES, Column, Row, Table, levels, table_of
+from oracles import tiny_training
+
+ROOT = Path(__file__).resolve().parents[2]
+COLUMNS = (
+    Column("Car 3-D all", "any", ("Car", "3d", "all", 0)),
+    Column("Car BEV all", "any", ("Car", "bev", "all", 0)),
+)
+TINY = Table(
+    title="a table",
+    protocol="a paper's data",
+    recipe="tiny",
+    columns=COLUMNS,
+    rows=(
+        Row("quoted", (50.0, None)),
+        Row("centred", (60.0, 70.0), {"centred_anchors": True}),
+        Row("plain", (61.0, 71.0), {}),
+    ),
+    remarks=("a remark",),
+)
+
+
+def tiny_recipe() -> Recipe:
+    plain = tiny_training.recipe(iterations=2).model_dump(mode="python")
+    return parse_recipe({**plain, "validation": {"source": {"kind": "kitti", "split": "val"}}})
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Sources are frames in memory; returns the splits that were opened."""
+    splits: list[str] = []
+
+    def open_source(section: Any, data: Path | None) -> FrameSource:
+        splits.append(section.split)
+        return tiny_training.frames(3, seed=len(section.split))
+
+    monkeypatch.setattr("beambox.train.loop.open_source", open_source)
+    monkeypatch.setattr("beambox.train.ablation.open_source", open_source)
+    return splits
+
+
+def test_every_row_is_trained_for_every_seed_and_nothing_twice(tmp_path: Path, opened: list[str]) -> None:
+    said: list[str] = []
+    measured = run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], said.append)
+    assert {name: len(runs) for name, runs in measured.items()} == {"centred": 2, "plain": 2}
+    assert all(len(run) == 2 and all(v is not None for v in run) for runs in measured.values() for run in runs)
+    assert [line.split(":")[0] for line in said] == [
+        "row centred, seed 0 (1 of 4)",
+        "row centred, seed 1 (2 of 4)",
+        "row plain, seed 0 (3 of 4)",
+        "row plain, seed 1 (4 of 4)",
+    ]
+    assert opened == ["val", "train", "train", "train", "train"]
+    again = run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], said.append)
+    assert again == measured
+    assert opened[5:] == ["val"]
+
+
+def test_rows_of_a_seed_start_from_the_same_random_numbers(tmp_path: Path, opened: list[str]) -> None:
+    run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], lambda _: None)
+    logs = {path.parent.name: path.read_text() for path in (tmp_path / "tiny" / "as-recipe").glob("*/log.jsonl")}
+    assert len(logs) == 2
+    held = json.loads((tmp_path / "tiny" / "as-recipe" / "seed-1" / "recipe.json").read_text())
+    assert held["seed"] == 1
+    assert held["validation"] is None
+
+
+def test_an_interrupted_run_goes_on(tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    resumed: list[bool] = []
+
+    def stopped(*args: Any, resume: bool) -> Any:
+        resumed.append(resume)
+        outcome = train(*args, resume=resume)
+        return replace(outcome, finished=len(resumed) > 1)
+
+    train = ablation.train
+    monkeypatch.setattr(ablation, "train", stopped)
+    with pytest.raises(Interrupted):
+        run_table(TINY, tiny_recipe(), None, tmp_path, [0], lambda _: None)
+    folder = next((tmp_path / "tiny").iterdir()) / "seed-0"
+    (folder / "final.safetensors").unlink()  # a stopped run has a checkpoint and no final weights
+    run_table(TINY, tiny_recipe(), None, tmp_path, [0], lambda _: None)
+    assert resumed[:2] == [False, True]
+
+
+def test_runs_of_another_recipe_are_not_taken_for_these(tmp_path: Path, opened: list[str]) -> None:
+    run_table(TINY, tiny_recipe(), None, tmp_path, [0], lambda _: None)
+    other = tiny_recipe().model_copy(update={"ema": None})
+    with pytest.raises(BeamboxError, match=r"holds a run of another recipe \(its `ema` differs\); remove it or give"):
+        run_table(TINY, other, None, tmp_path, [0], lambda _: None)
+
+
+def test_what_cannot_be_run_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    without = tiny_recipe().model_copy(update={"validation": None})
+    with pytest.raises(BeamboxError, match="recipe tiny has no `validation`, whose source a table is scored on"):
+        run_table(TINY, without, None, tmp_path, [0])
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(BeamboxError, match="ablate runs in one process"):
+        run_table(TINY, tiny_recipe(), None, tmp_path, [0])
+
+
+def test_switches_are_laid_over_the_recipes_options() -> None:
+    base = {"a": 1, "inner": {"x": 1, "y": 2}}
+    assert merged(base, {"inner": {"y": 3}, "b": 4}) == {"a": 1, "inner": {"x": 1, "y": 3}, "b": 4}
+    assert base == {"a": 1, "inner": {"x": 1, "y": 2}}
+    made = row_recipe(tiny_recipe(), {"centred_anchors": True}, 7)
+    assert made.detector.options == {**tiny_training.OPTIONS, "centred_anchors": True}
+    assert made.seed == 7
+
+
+def test_folders_tell_switches_apart() -> None:
+    names = [ablation.folder_name(o) for o in ({}, {"a": "HA"}, {"a": "CA"}, {"a": True}, {"a": 1}, {"b": {"c": [1]}})]
+    assert names[0] == "as-recipe"
+    assert names[1].startswith("a=HA_")
+    assert len(set(names)) == len(names)
+
+
+def test_report_keeps_the_papers_numbers_and_ours_on_lines_of_their_own() -> None:
+    measured: ablation.Measured = {"centred": [[1.0, 2.0], [3.0, 4.0]], "plain": [[5.0, None], [6.0, 7.0]]}
+    assert report(TINY, measured, "3 frames").splitlines() == [
+        "a table",
+        "paper: a paper's data",
+        "a remark",
+        "ours:  3 frames",
+        "       compare differences between rows: data and length of training may not be the paper's",
+        "",
+        "                Car 3-D all  Car BEV all",
+        "                        any          any",
+        "quoted   paper        50.00            -",
+        "centred  paper        60.00        70.00",
+        "          ours         2.00         3.00",
+        "            +-         1.41         1.41",
+        "plain    paper        61.00        71.00",
+        "          ours         5.50            -",
+        "            +-         0.71            -",
+    ]
+    alone = report(TINY, {})
+    assert "ours" not in alone
+
+
+def test_json_keeps_them_apart_too() -> None:
+    told = to_json(TINY, {"plain": [[1.0, None]]}, tiny_recipe(), [3])
+    assert told["columns"] == ["Car 3-D all any", "Car BEV all any"]
+    assert told["seeds"] == [3]
+    assert told["rows"][2] == {"name": "plain", "options": {}, "paper": [61.0, 71.0], "ours": [[1.0, None]]}
+    assert told["rows"][0] == {"name": "quoted", "options": None, "paper": [50.0, None], "ours": []}
+    json.dumps(told)
+
+
+def test_columns_find_their_numbers_in_a_kitti_result() -> None:
+    def averages(first: float) -> tuple[AveragePrecision, ...]:
+        return tuple(AveragePrecision(first + i, first + 10 + i, 0.0, ()) for i in range(3))
+
+    car = ClassResult("Car", 0.7, (9, 9, 9), averages(10), averages(30), averages(50), averages(70))
+    scores = KittiResult((car,), ("easy", "moderate", "hard"), 5).to_json()
+    table = table_of("hcnet-table2")
+    found = [value_at(scores, column.path) for column in table.columns]
+    assert found == [30, 31, 32, 10, 11, 12, 70, 71, 72]
+    assert [value_at(scores, c.path) for c in levels("Car", "3d", "R11")] == [20, 21, 22]
+    assert value_at(scores, ("Cyclist", "3d", "R11", 0)) is None
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_name_a_recipe_of_ours_and_options_that_exist(name: str) -> None:
+    table = TABLES[name]
+    made = read_recipe(ROOT / "recipes" / f"{table.recipe}.yaml")
+    assert made.validation is not None
+    configs = []
+    for row in table.rows:
+        assert len(row.published) == len(table.columns)
+        if row.options is not None:
+            options = row_recipe(made, row.options, 0).detector.options
+            configs.append(config_from_dict(CATALOGUE[made.detector.name].config, options))
+    assert configs
+    assert len({repr(config) for config in configs}) == len(configs), "two rows with the same switches"
+
+
+def test_a_wrong_name_is_answered_with_the_nearest() -> None:
+    with pytest.raises(BeamboxError, match=r'there is no table "hcnet-tabel3" \(did you mean "hcnet-table3"\?\)'):
+        table_of("hcnet-tabel3")
+
+
+def run_command(*words: str) -> Any:
+    app = Typer()
+    app.command()(ablate.command)
+    return CliRunner().invoke(app, list(words))
+
+
+def test_published_numbers_can_be_read_without_training() -> None:
+    printed = run_command("hcnet-table4", "--published")
+    assert printed.exit_code == 0
+    assert "OIFM        paper     88.32     78.08     76.52" in printed.output
+    assert "Car 3-D R11" in printed.output
+
+
+def test_the_command_trains_and_prints(tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TABLES, "tiny", TINY)
+    monkeypatch.chdir(tmp_path)
+    Path("recipes").mkdir()
+    Path("recipes/tiny.yaml").write_text(json.dumps(tiny_recipe().model_dump(mode="json")), encoding="utf-8")
+    done = run_command(
+        "tiny", "--seeds", "0,4", "--iterations", "1", "--json", "numbers.json", "--set", "optim.batch=1"
+    )
+    assert done.exit_code == 0, done.output
+    assert "recipe tiny, 1 steps, batch 1, seeds 0,4; scored on `val`" in done.output
+    numbers = json.loads(Path("numbers.json").read_text())
+    assert [len(row["ours"]) for row in numbers["rows"]] == [0, 2, 2]
+    assert numbers["recipe"]["optim"]["batch"] == 1
+
+
+@pytest.mark.parametrize("text", ["", "a", "0,0", "-1", "1,,2"])
+def test_seeds_must_be_different_whole_numbers(text: str) -> None:
+    with pytest.raises(BeamboxError, match="--seeds takes different whole numbers, as 0,1,2; got"):
+        ablate.parse_seeds(text)
+    assert ablate.parse_seeds("0, 2") == [0, 2]
+
+
+def test_a_missing_recipe_or_folder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    error = run_command("hcnet-table3").exception
+    assert "run this in the folder that holds recipes/, or give the file with --recipe" in str(error)
+    monkeypatch.chdir(ROOT)
+    error = run_command("hcnet-table3", "--data", str(tmp_path / "none")).exception
+    assert str(error) == f"--data: there is no folder {tmp_path / 'none'}"
