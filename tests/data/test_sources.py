@@ -1,8 +1,7 @@
-"""Layouts other than KITTI's: ONCE, and folders of one's own."""
+"""Folders of one's own."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,30 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.data.custom import FolderSource, format_boxes, parse_boxes
-from beambox.data.once import OnceSource, parse_sequence
+from beambox.data.folder import FolderSource, format_boxes, parse_boxes
 from beambox.data.source import FrameSource
 from beambox.structures import Labels
 from oracles.paths import data_dir
 
-BOX = [-3.0, 12.5, -0.9, 4.4, 1.9, 1.6, 0.5]
 CLOUD = np.random.default_rng(0).random((30, 4)).astype(np.float32)
-
-
-def once(root: Path) -> Path:
-    frames = [
-        {"frame_id": "100", "pose": [], "annos": {"names": ["Car", "Bus"], "boxes_3d": [BOX, BOX], "boxes_2d": {}}},
-        {"frame_id": "200", "pose": []},
-        {"frame_id": "300", "pose": [], "annos": {"names": [], "boxes_3d": []}},
-    ]
-    folder = root / "data" / "000076"
-    (folder / "lidar_roof").mkdir(parents=True)
-    (folder / "000076.json").write_text(json.dumps({"meta_info": {}, "calib": {}, "frames": frames}))
-    for frame in frames:
-        CLOUD.tofile(folder / "lidar_roof" / f"{frame['frame_id']}.bin")
-    (root / "ImageSets").mkdir()
-    (root / "ImageSets" / "train.txt").write_text("000076\n")
-    return root
 
 
 def own(root: Path) -> Path:
@@ -48,53 +29,6 @@ def own(root: Path) -> Path:
     (root / "labels" / "a.txt").write_text("# class x y z l w h yaw\nForklift 1 2 3 4 5 6 0.5 and more\n\n")
     (root / "ImageSets" / "train.txt").write_text("b\n")
     return root
-
-
-def test_once_frames_come_with_their_boxes_as_they_are(tmp_path: Path) -> None:
-    source = OnceSource(once(tmp_path))
-    assert isinstance(source, FrameSource)
-    assert len(source) == 1 and list(source.ids) == ["100"]
-    frame = source[0]
-    assert frame.id == "100" and torch.equal(frame.points, torch.from_numpy(CLOUD))
-    assert frame.labels is not None and frame.labels.names == ("Car", "Bus")
-    torch.testing.assert_close(frame.labels.boxes, torch.tensor([BOX, BOX]))
-    every = OnceSource(tmp_path, labelled=False, intensity_scale=0.5)
-    assert list(every.ids) == ["100", "200", "300"] and every[1].labels is None
-    torch.testing.assert_close(every[1].points[:, 3], torch.from_numpy(CLOUD[:, 3] / 2))
-
-
-def test_bad_once_folders_are_named(tmp_path: Path) -> None:
-    with pytest.raises(MissingFileError, match=r"expected ROOT/ImageSets and ROOT/data, ONCE's layout"):
-        OnceSource(tmp_path)
-    once(tmp_path)
-    with pytest.raises(MissingFileError, match=r'no split "trian" \(did you mean "train"\?\)'):
-        OnceSource(tmp_path, "trian")
-    path = tmp_path / "data" / "000076" / "000076.json"
-    path.write_text('{"frames": [}')
-    with pytest.raises(BeamboxError, match=r"000076.json, line 1: not valid JSON"):
-        OnceSource(tmp_path)
-    path.write_text('{"frames": []}')
-    with pytest.raises(BeamboxError, match="its sequences have no annotated frame"):
-        OnceSource(tmp_path)
-    path.unlink()
-    with pytest.raises(MissingFileError, match="is not there; it lists the frames of a sequence"):
-        OnceSource(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "[]",
-        '{"frames": 3}',
-        '{"frames": [{}]}',
-        '{"frames": [{"frame_id": 1, "annos": {"names": ["Car"], "boxes_3d": [[1, 2]]}}]}',
-        '{"frames": [{"frame_id": 1, "annos": {"names": [], "boxes_3d": [[1, 2, 3, 4, 5, 6, 7]]}}]}',
-        '{"frames": [{"frame_id": 1, "annos": {"names": ["Car"], "boxes_3d": [["a"]]}}]}',
-    ],
-)
-def test_bad_sequences_are_named(text: str) -> None:
-    with pytest.raises(BeamboxError, match=r"^seq\.json: expected `frames`, each with `frame_id`"):
-        parse_sequence(text, "seq.json")
 
 
 def test_a_folder_of_ones_own(tmp_path: Path) -> None:

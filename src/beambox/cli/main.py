@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
     "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
+    "data": ("beambox.cli.data:app", "check a data set of one's own before training, and propose anchors for it"),
     "score": ("beambox.cli.score:app", "score result files of any detector by the rules of KITTI or ONCE"),
 }
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from beambox.checks import BeamboxError
-from beambox.cli.main import guard
+from beambox.cli.main import guard, help_of
 
 __all__ = ["app", "parse_overlaps"]
 
@@ -48,8 +48,6 @@ def write_json(path: Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
-@app.command()
-@guard
 def kitti(
     labels: Annotated[Path, typer.Option(help="folder of label files (or the KITTI root above label_2)")],
     results: Annotated[Path, typer.Option(help="folder of result files, one a frame; empty: nothing found")],
@@ -63,7 +61,12 @@ def kitti(
     allow_missing: Annotated[bool, typer.Option("--allow-missing", help="no result file means nothing found")] = False,
     json: Json = None,
 ) -> None:
-    """Score KITTI result files as the official program does (needs no images, points or calibration)."""
+    """Score KITTI result files as the official program does (needs no images, points or calibration).
+
+    Examples:
+      beambox score kitti --labels kitti/training/label_2 --results out --frames kitti/ImageSets/val.txt
+      beambox score kitti --labels kitti --results out --classes Car --iou Car=0.5 --json ap.json
+    """
     from beambox.metrics.kitti import evaluate_files
     from beambox.metrics.kitti_objects import read_frame_list
 
@@ -82,8 +85,6 @@ def kitti(
         write_json(json, result.to_json())
 
 
-@app.command()
-@guard
 def once(
     annotations: Annotated[Path, typer.Option(help="JSON with ground_truth, and with predictions unless --results")],
     results: Annotated[Path | None, typer.Option(help="JSON list of predictions in a file of its own")] = None,
@@ -93,7 +94,12 @@ def once(
     published: Annotated[bool, typer.Option("--published", help="also print the rows of DenNet's Table 3")] = False,
     json: Json = None,
 ) -> None:
-    """Score ONCE predictions as the official devkit does."""
+    """Score ONCE predictions as the official devkit does.
+
+    Examples:
+      beambox score once --annotations annotations.json
+      beambox score once --annotations val.json --results predictions.json --published --json ap.json
+    """
     from beambox.metrics.once import evaluate_annotations
 
     result = evaluate_annotations(
@@ -106,3 +112,7 @@ def once(
     print(result.table(published=published), end="")
     if json is not None:
         write_json(json, result.to_json())
+
+
+for function in (kitti, once):
+    app.command(help=help_of(function))(guard(function))

@@ -1,143 +1,182 @@
-"""Your own recordings: sweeps of any format, and boxes as plain text in the LiDAR's frame.
+"""A data set of one's own, described by one small YAML file; see docs/custom_data.md.
 
-.. code-block:: text
-
-    ROOT/
-      points/NAME.bin  (.npy .npz .pcd .ply .las .laz)
-      labels/NAME.txt          a line an object: class x y z l w h yaw  (metres, radians; # begins a comment)
-      ImageSets/train.txt      optional lists of names; where absent, every sweep
-
-x, y, z is the box's geometric centre; yaw grows counter-clockwise seen from above, 0 along +x. Further columns of a
-label line are ignored.
+Frames come in the house's LiDAR frame: x forward, y left, z up, and the ground at -1.73 m where the sensor's height is
+known. No camera is needed; there are no difficulty levels, and the metrics give one AP a class.
 """
 
 from __future__ import annotations
 
-import math
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.data.box_files import (
+    CAMERA_AT_THE_SENSOR,
+    NamedBoxes,
+    parse_box_file,
+    parse_frames_file,
+    parse_kitti_boxes,
+)
+from beambox.data.custom_config import CustomConfig, read_custom_config
 from beambox.data.files import read_text
-from beambox.data.reading import SUFFIXES, read_frame
+from beambox.data.kitti_text import read_calibration
+from beambox.data.names import NameList
+from beambox.data.reading import read_frame
+from beambox.data.road import fit_road_plane
+from beambox.geometry.axes import Axes, turn_boxes
+from beambox.geometry.boxes import wrap_angle
+from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.structures import Frame, Labels
 
-__all__ = ["FolderSource", "format_boxes", "parse_boxes"]
+__all__ = ["CustomSource"]
+
+NO_BOXES = NamedBoxes((), np.zeros((0, 7)), ())
 
 
-class FolderSource:
-    """The frames of a folder of one's own (drawn at the top of this module)."""
+class CustomSource:
+    """The frames of one split of a data set described by a YAML file."""
 
-    def __init__(
-        self,
-        root: Path | str,
-        split: str = "all",
-        *,
-        points: str = "points",
-        labels: str = "labels",
-        fields: str | Sequence[str] | None = None,
-        intensity_scale: float | None = None,
-    ) -> None:
-        """Find the sweeps; nothing is read yet.
+    def __init__(self, config: Path | str, split: str = "all", *, whole: bool = False) -> None:
+        """Read the description and find the frames; no sweep is read yet.
 
         Args:
-            root: the folder.
-            split: name of a list in ImageSets/; "all" is every sweep.
-            points: name of the folder of sweeps.
-            labels: name of the folder of labels; a sweep without a file there has no labels.
-            fields: see :func:`beambox.data.reading.read_frame`.
-            intensity_scale: see :func:`beambox.data.reading.read_frame`; give it where sweeps of one sensor are of
-                different brightness, so that all are scaled alike.
+            config: the YAML file.
+            split: a name under ``splits``, or "all" for every sweep that is there.
+            whole: keep what lies outside ``range`` and boxes with fewer than ``min_points`` points, to look at the data
+                as it is.
 
         Raises:
-            MissingFileError: if the folder, the list or a sweep of it is not there.
-            BeamboxError: if there is no sweep, or two have one name.
+            MissingFileError: if the file, a folder or a list is not there.
+            BeamboxError: if the description is wrong or there is no frame.
         """
-        self.root = Path(root)
-        self.labels_folder = self.root / labels
-        self.fields, self.intensity_scale = fields, intensity_scale
-        folder = self.root / points
-        if not folder.is_dir():
-            raise MissingFileError(f"{folder} is not a folder; expected one of sweeps ({' '.join(SUFFIXES)})")
-        found: dict[str, Path] = {}
-        for path in sorted(folder.iterdir()):
-            if path.suffix.lower() in SUFFIXES:
-                if path.stem in found:
-                    raise BeamboxError(f"{folder} holds two sweeps called {path.stem}; names must differ")
-                found[path.stem] = path
-        if not found:
-            raise BeamboxError(f"{folder} must hold sweeps ({' '.join(SUFFIXES)}), but has none")
-        names = list(found) if split == "all" else _names(self.root / "ImageSets", split)
-        for name in names:
-            if name not in found:
-                raise MissingFileError(f'split "{split}" names {name}, but {folder} holds no such sweep')
-        self._paths = [found[name] for name in names]
+        self.path = Path(config)
+        self.root = self.path.parent
+        self.config = read_custom_config(self.path)
+        self.whole = whole
+        self.axes = Axes.parse(self.config.axes)
+        self._ids = _frame_names(self.root, self.config, split, self.path)
+        self._all_boxes = self._read_all_boxes()
 
     @property
     def ids(self) -> Sequence[str]:
-        """Name of each sweep."""
-        return [path.stem for path in self._paths]
+        """Name of each frame."""
+        return self._ids
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Classes wanted."""
+        return tuple(self.config.classes)
 
     def __len__(self) -> int:
-        return len(self._paths)
+        return len(self._ids)
 
     def __getitem__(self, index: int) -> Frame:
-        """Read one frame."""
-        path = self._paths[index]
-        frame = read_frame(path, fields=self.fields, intensity_scale=self.intensity_scale)
-        text = self.labels_folder / f"{path.stem}.txt"
-        return replace(frame, labels=parse_boxes(read_text(text), str(text)) if text.exists() else None)
+        """Read one frame.
+
+        Raises:
+            MissingFileError: if its sweep is not there.
+            BeamboxError: naming file and line, if something cannot be read or a class is not mapped.
+        """
+        name = self._ids[index]
+        path = self.root / _fill(self.config.points, name)
+        if not path.is_file():
+            raise MissingFileError(f"{path} is not there, the sweep of frame {name}")
+        frame = read_frame(path, fields=self.config.fields, intensity_scale=self.config.intensity_scale)
+        points = frame.points.clone()
+        points[:, :3] = points[:, :3] @ self.axes.matrix.T.to(points)
+        points[:, 2] += self.config.raise_by
+        labels = self.labels(index)
+        if not self.whole:
+            points, labels = self._crop(points, labels)
+        return replace(frame, points=points, id=name, labels=labels, plane=fit_road_plane(points))
+
+    def labels(self, index: int) -> Labels | None:
+        """Read the boxes of a frame, and no points; None where the frame has no label file."""
+        found = self._boxes(self._ids[index])
+        if found is None:
+            return None
+        boxes = turn_boxes(torch.from_numpy(found.boxes), self.axes.matrix)
+        boxes[:, 2] += self.config.raise_by
+        boxes[:, 6] = wrap_angle(boxes[:, 6])
+        names = [self.config.class_of(name, place) for name, place in zip(found.names, found.places)]
+        keep = [k for k, name in enumerate(names) if name is not None]
+        return Labels(boxes[keep], tuple(name for name in names if name is not None))
+
+    def _boxes(self, name: str) -> NamedBoxes | None:
+        pattern, kind = self.config.labels, self.config.label_format
+        if pattern is None or kind is None:
+            return None
+        if self._all_boxes is not None:  # in a table, a frame without a row has no objects
+            return self._all_boxes.get(name, None if kind == "once" else NO_BOXES)
+        path = self.root / _fill(pattern, name)
+        if not path.is_file():
+            return None
+        if kind == "kitti":
+            calibration = CAMERA_AT_THE_SENSOR
+            if self.config.calibration is not None:
+                calibration = read_calibration(self.root / _fill(self.config.calibration, name))
+            return parse_kitti_boxes(read_text(path), calibration, str(path))
+        if kind == "once":
+            return parse_frames_file(read_text(path), kind, str(path)).get(name)
+        return parse_box_file(read_text(path), kind, str(path))
+
+    def _read_all_boxes(self) -> dict[str, NamedBoxes] | None:
+        """Read the one file of all frames' boxes, where there is such a file."""
+        pattern, kind = self.config.labels, self.config.label_format
+        if pattern is None or kind is None or "{frame}" in pattern:
+            return None
+        return parse_frames_file(read_text(self.root / pattern), kind, str(self.root / pattern))
+
+    def _crop(self, points: Tensor, labels: Labels | None) -> tuple[Tensor, Labels | None]:
+        if self.config.range is not None:
+            points = points[_inside(points, self.config.range)]
+            labels = None if labels is None else labels[_inside(labels.boxes, self.config.range)]
+        if self.config.min_points and labels is not None and len(labels):
+            counts = points_in_boxes_mask(points[:, :3], labels.boxes).sum(dim=1)  # (M,)
+            labels = labels[counts >= self.config.min_points]
+        return points, labels
 
 
-def _names(sets: Path, split: str) -> list[str]:
-    listing = sets / f"{split}.txt"
-    if not listing.exists():
-        known = [*(path.stem for path in sets.glob("*.txt")), "all"]
-        raise MissingFileError(f'{listing} is not there: no split "{split}"{did_you_mean(split, known)}')
-    names = read_text(listing).split()
-    if not names:
-        raise BeamboxError(f"{listing} must name the frames of the split, one a line, but is empty")
-    return names
+def _fill(pattern: str, name: str) -> str:
+    return pattern.replace("{frame}", name)
 
 
-def parse_boxes(text: str, where: str = "labels") -> Labels:
-    """Parse lines of ``class x y z l w h yaw``; empty lines and those that begin with # are passed over.
-
-    Args:
-        text: content of a label file.
-        where: what to call it in messages.
-
-    Raises:
-        BeamboxError: naming the line, if it has too few columns or is not numeric.
-    """
-    names, rows = [], []
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) < 8:
-            raise BeamboxError(f"{where}, line {number}: expected `class x y z l w h yaw`, got {len(words)} columns")
-        try:
-            values = [float(word) for word in words[1:8]]
-        except ValueError:
-            values = [math.nan]
-        if not all(map(math.isfinite, values)):
-            raise BeamboxError(
-                f"{where}, line {number}: expected a class and 7 numbers, got {' '.join(words[:8])[:60]!r}"
-            )
-        if min(values[3:6]) < 0:
-            raise BeamboxError(f"{where}, line {number}: l, w and h must be at least 0, got {' '.join(words[4:7])}")
-        names.append(words[0])
-        rows.append(values)
-    return Labels(torch.tensor(rows, dtype=torch.float32).reshape(-1, 7), tuple(names))
+def _inside(rows: Tensor, limits: tuple[float, float, float, float]) -> Tensor:
+    x, y = rows[:, 0], rows[:, 1]
+    return (x >= limits[0]) & (x < limits[2]) & (y >= limits[1]) & (y < limits[3])
 
 
-def format_boxes(labels: Labels) -> str:
-    """Write lines of ``class x y z l w h yaw``; inverse of :func:`parse_boxes` to a tenth of a millimetre."""
-    return "".join(
-        " ".join([name, *(f"{value:.4f}" for value in box)]) + "\n"
-        for name, box in zip(labels.names, labels.boxes.tolist())
-    )
+def _frame_names(root: Path, config: CustomConfig, split: str, where: Path) -> NameList:
+    if split in config.splits:
+        listing = root / config.splits[split]
+        names = NameList(read_text(listing, f"the list of the split {split}").split())
+        if not len(names):
+            raise BeamboxError(f"{listing} must name the frames of the split {split}, one a line, but is empty")
+        repeated = names.first_repeated()
+        if repeated is not None:
+            raise BeamboxError(f"{listing} must name each frame once, but names {repeated} again")
+        return names
+    if split != "all":
+        raise BeamboxError(f'{where} has no split "{split}"{did_you_mean(split, [*config.splits, "all"])}')
+    pattern = Path(config.points)
+    folder, (begin, end) = root / pattern.parent, pattern.name.split("{frame}", 1)
+    if "{frame}" in str(pattern.parent):
+        raise BeamboxError(f"{where}: to find all frames, {{frame}} must stand in the file's name; or give `splits`")
+    if not folder.is_dir():
+        raise MissingFileError(f"{folder}, the folder of the sweeps, is not there")
+    with os.scandir(folder) as entries:
+        files = (entry.name for entry in entries)
+        found = sorted(
+            file[len(begin) : len(file) - len(end)]
+            for file in files
+            if file.startswith(begin) and file.endswith(end) and len(file) > len(begin) + len(end)
+        )
+    if not found:
+        raise BeamboxError(f"{folder} holds no sweep {_fill(pattern.name, '*')}")
+    return NameList(found)

@@ -1,0 +1,94 @@
+"""`beambox data check|anchors`: look at a data set before training on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from beambox.cli.main import guard, help_of
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Look at a data set: read all of it and say what seems wrong, or propose anchors for it.",
+)
+
+DATA = Annotated[Path, typer.Argument(metavar="DATA", help="YAML file of a data set, or a KITTI or ONCE folder.")]
+SPLIT = Annotated[str, typer.Option(help="List of frames; all is every frame.")]
+FRAMES = Annotated[int | None, typer.Option(min=1, help="Look at this many frames, spread evenly; default: all.")]
+
+
+def check(
+    data: DATA,
+    split: SPLIT = "all",
+    frames: FRAMES = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Also write the report to this file.")] = None,
+) -> None:
+    """Read everything and report what looks wrong; status 2 if a frame cannot be read.
+
+    Examples:
+      beambox data check data.yaml
+      beambox data check kitti --split train --frames 200
+    """
+    import json
+
+    from beambox.checks import BeamboxError
+    from beambox.cli.console import progress
+    from beambox.data.check_text import report_json, report_text
+    from beambox.data.checking import check_frames
+    from beambox.data.custom import CustomSource
+    from beambox.data.custom_config import KITTI_GROUND
+    from beambox.data.files import write_text
+    from beambox.data.opening import open_data
+
+    source = open_data(data, split)
+    limits, ground = None, None
+    if isinstance(source, CustomSource):
+        source = CustomSource(data, split, whole=True)
+        limits = source.config.range
+        ground = None if source.config.sensor_height is None else KITTI_GROUND
+    chosen = spread(len(source), frames)
+    report = check_frames(source, progress(chosen, len(chosen), "reading"), limits)
+    print(report_text(report, ground), end="")
+    if json_file is not None:
+        write_text(json_file, json.dumps(report_json(report, ground), indent=1, allow_nan=False) + "\n")
+    if report.unreadable:
+        raise BeamboxError(f"{len(report.unreadable)} of {report.frames} frames cannot be read")
+
+
+def anchors(data: DATA, split: SPLIT = "all", frames: FRAMES = None) -> None:
+    """Propose anchor sizes and heights from the labels, as lines for a recipe.
+
+    Examples:
+      beambox data anchors data.yaml --split train
+    """
+    from beambox.checks import BeamboxError
+    from beambox.cli.console import progress
+    from beambox.data.anchor_sizes import proposals_text, propose_anchors
+    from beambox.data.opening import open_data
+
+    source = open_data(data, split)
+    chosen = spread(len(source), frames)
+    labels = (source[index].labels for index in progress(chosen, len(chosen), "reading"))
+    proposals = propose_anchors(one for one in labels if one is not None)
+    if not proposals:
+        raise BeamboxError(f"{data} has no labelled box in the split {split}, so there is nothing to propose")
+    print(proposals_text(proposals), end="")
+
+
+def spread(total: int, wanted: int | None) -> list[int]:
+    """Return the positions of ``wanted`` frames, spread evenly over all; all of them where None."""
+    if wanted is None or wanted >= total:
+        return list(range(total))
+    return [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
+
+
+for function in (check, anchors):
+    app.command(help=help_of(function))(guard(function))

@@ -1,0 +1,208 @@
+"""Files of labelled boxes in several formats, read into names and numbers.
+
+pandaset
+    text, one box a line: ``label x y z l w h yaw [points sensor uuid]``, centres; lines that begin with # are left out.
+csv
+    a header line with name, x, y, z, l, w, h, yaw in any order, and frame where one file holds all frames; further
+    columns are left out.
+json
+    a list of objects ``{"name", "x", "y", "z", "l", "w", "h", "yaw"}`` or ``{"name", "box": [7 numbers]}``, with
+    "frame" where one file holds all frames; or what ``beambox detect --format json`` writes.
+once
+    one file ``{"frames": [{"frame_id", "annos": {"names", "boxes_3d"}}]}``.
+kitti
+    label_2 text; boxes in a camera frame.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from beambox.checks import BeamboxError, did_you_mean
+from beambox.data.kitti_text import parse_labels
+from beambox.geometry.calibration import Calibration
+
+__all__ = ["CAMERA_AT_THE_SENSOR", "NamedBoxes", "parse_box_file", "parse_frames_file", "parse_kitti_boxes"]
+
+NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw")
+ALIASES = {
+    "name": ("name", "label", "class", "type", "category"),
+    "frame": ("frame", "frame_id", "scan", "sweep"),
+    "l": ("l", "length", "dx"),
+    "w": ("w", "width", "dy"),
+    "h": ("h", "height", "dz"),
+    "yaw": ("yaw", "heading", "theta", "rotation"),
+}
+CAMERA_AT_THE_SENSOR = Calibration(
+    p2=torch.tensor([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
+    r0=torch.eye(3),
+    velo_to_cam=torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]),
+)
+"""Camera axes (x right, y down, z forward) with the sensor as origin, for label files without a calibration."""
+
+
+@dataclass(frozen=True)
+class NamedBoxes:
+    """Boxes as a file has them; N boxes."""
+
+    names: tuple[str, ...]
+    """Name of each as written."""
+    boxes: NDArray[np.float64]
+    """``(N, 7)`` x, y, z, l, w, h, yaw, in the file's axes."""
+    places: tuple[str, ...]
+    """Where each stands in the file, for messages."""
+
+
+def parse_box_file(text: str, kind: str, where: str) -> NamedBoxes:
+    """Read the boxes of one frame.
+
+    Args:
+        text: content of the file.
+        kind: pandaset, csv or json.
+        where: what errors call the file.
+
+    Raises:
+        BeamboxError: naming file and line or entry.
+    """
+    rows = {"pandaset": _pandaset_rows, "csv": _csv_rows, "json": _json_rows}[kind](text, where)
+    return _collect([row[1:] for row in rows])
+
+
+def parse_frames_file(text: str, kind: str, where: str) -> dict[str, NamedBoxes]:
+    """Read the boxes of all frames from one file: csv, json or once. Frames without a box may be absent.
+
+    Raises:
+        BeamboxError: naming file and line or entry.
+    """
+    if kind not in ("csv", "json", "once"):
+        raise BeamboxError(f"{where}: boxes in {kind} format come as one file a frame; put {{frame}} into its path")
+    rows = {"csv": _csv_rows, "json": _json_rows, "once": _once_rows}[kind](text, where)
+    by_frame: dict[str, list[tuple[str, Sequence[float], str]]] = {}
+    for frame, name, numbers, place in rows:
+        if frame is None:
+            raise BeamboxError(f"{place}: one file for all frames needs the frame of each box under `frame`")
+        found = by_frame.setdefault(frame, [])
+        if name:
+            found.append((name, numbers, place))
+    return {frame: _collect(found) for frame, found in by_frame.items()}
+
+
+def parse_kitti_boxes(text: str, calibration: Calibration, where: str) -> NamedBoxes:
+    """Read a KITTI label file's boxes, carried into the LiDAR frame; DontCare regions are left out."""
+    labels = parse_labels(text, calibration, where)
+    return NamedBoxes(labels.names, labels.boxes.double().numpy(), (where,) * len(labels))
+
+
+Row = tuple[Any, str, Sequence[float], str]  # frame or None, name ("" for a frame without boxes), seven numbers, place
+
+
+def _collect(rows: Iterable[tuple[str, Sequence[float], str]]) -> NamedBoxes:
+    rows = list(rows)
+    for _, numbers, place in rows:
+        if not all(math.isfinite(value) for value in numbers) or min(numbers[3:6]) < 0:
+            raise BeamboxError(f"{place}: expected finite numbers and sizes l, w, h of at least 0, got {list(numbers)}")
+    boxes = np.array([numbers for _, numbers, _ in rows], dtype=np.float64).reshape(-1, 7)
+    return NamedBoxes(tuple(name for name, _, _ in rows), boxes, tuple(place for _, _, place in rows))
+
+
+def _floats(words: Sequence[Any], place: str) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except (TypeError, ValueError):
+        raise BeamboxError(f"{place}: expected numbers x y z l w h yaw, got {list(words)}") from None
+
+
+def _pandaset_rows(text: str, where: str) -> Iterable[Row]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        place = f"{where}, line {number}"
+        if len(words) < 8:
+            raise BeamboxError(f"{place}: expected label x y z l w h yaw, got {len(words)} columns")
+        yield None, words[0], _floats(words[1:8], place), place
+
+
+def _columns(known: Iterable[str], place: str) -> dict[str, str]:
+    """Find the names under which a file has its columns."""
+    have = {str(name).strip().lower(): name for name in known}
+    found = {}
+    for wanted in ("frame", "name", *NUMBERS):
+        match = next((have[alias] for alias in ALIASES.get(wanted, (wanted,)) if alias in have), None)
+        if match is not None:
+            found[wanted] = match
+        elif wanted != "frame":
+            raise BeamboxError(f"{place}: there is no column `{wanted}`{did_you_mean(wanted, map(str, have))}")
+    return found
+
+
+def _csv_rows(text: str, where: str) -> Iterable[Row]:
+    reader = csv.DictReader(io.StringIO(text))
+    if reader.fieldnames is None:
+        raise BeamboxError(f"{where} is empty; expected a header line with name, x, y, z, l, w, h, yaw")
+    columns = _columns(reader.fieldnames, f"{where}, line 1")
+    for row in reader:
+        place = f"{where}, line {reader.line_num}"
+        frame = row[columns["frame"]] if "frame" in columns else None
+        yield frame, str(row[columns["name"]]), _floats([row[columns[key]] for key in NUMBERS], place), place
+
+
+def _json(text: str, where: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BeamboxError(f"{where} is not valid JSON: {error}") from None
+
+
+def _json_rows(text: str, where: str) -> Iterable[Row]:
+    content = _json(text, where)
+    frame = None
+    if isinstance(content, dict) and isinstance(content.get("detections"), list):
+        frame, content = content.get("frame"), content["detections"]
+    if not isinstance(content, list):
+        raise BeamboxError(f"{where}: expected a list of boxes, got {type(content).__name__}")
+    for number, given in enumerate(content):
+        place = f"{where}, [{number}]"
+        if not isinstance(given, Mapping):
+            raise BeamboxError(f"{place}: expected an object with name, x, y, z, l, w, h, yaw")
+        box = given.get("box")
+        entry = {**given, **(dict(zip(NUMBERS, box)) if isinstance(box, list) and len(box) == 7 else {})}
+        columns = _columns(entry, place)
+        own = entry[columns["frame"]] if "frame" in columns else frame
+        numbers = _floats([entry[columns[key]] for key in NUMBERS], place)
+        yield None if own is None else str(own), str(entry[columns["name"]]), numbers, place
+
+
+def _once_rows(text: str, where: str) -> Iterable[Row]:
+    content = _json(text, where)
+    frames = content.get("frames") if isinstance(content, Mapping) else None
+    if not isinstance(frames, list):
+        raise BeamboxError(f"{where}: expected a list under the key `frames`")
+    for number, frame in enumerate(frames):
+        place = f"{where}, frames[{number}]"
+        if not isinstance(frame, Mapping) or "frame_id" not in frame:
+            raise BeamboxError(f"{place}: the key `frame_id` is missing")
+        annotations = frame.get("annos")
+        if annotations is None:
+            continue
+        names, boxes = (
+            annotations.get(key) if isinstance(annotations, Mapping) else None for key in ("names", "boxes_3d")
+        )
+        if not isinstance(names, list) or not isinstance(boxes, list) or len(names) != len(boxes):
+            raise BeamboxError(f"{place}.annos: expected lists `names` and `boxes_3d` of one length")
+        yield str(frame["frame_id"]), "", (), place
+        for k, (name, box) in enumerate(zip(names, boxes)):
+            where_box = f"{place}.annos.boxes_3d[{k}]"
+            if not isinstance(box, list) or len(box) != 7:
+                raise BeamboxError(f"{where_box}: expected 7 numbers x y z l w h yaw")
+            yield str(frame["frame_id"]), str(name), _floats(box, where_box), where_box

@@ -1,0 +1,160 @@
+"""What a check of a data set found, in words: a table of classes and a list of what looks wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from beambox.data.checking import FLOATING, TELLING_POINTS, BoxFacts, DataReport
+
+__all__ = ["class_rows", "report_json", "report_text", "warnings"]
+
+MANY = 0.5
+"""Share of a class's boxes from which a fault is taken to be one of the data set, not of single boxes."""
+FEW_BOXES = 5
+"""Fewer telling boxes than this do not accuse a class."""
+
+
+def class_rows(report: DataReport) -> list[dict[str, Any]]:
+    """Return the statistics of each class, the most frequent first."""
+    rows = []
+    joined = {name: held.joined() for name, held in report.by_class.items()}
+    for name, facts in sorted(joined.items(), key=lambda item: -len(item[1].boxes)):
+        boxes, points, gap = facts.boxes, facts.points, facts.gap
+        distance = np.hypot(boxes[:, 0], boxes[:, 1])
+        rows.append(
+            {
+                "name": name,
+                "boxes": len(boxes),
+                "frames": len(report.by_class[name].parts),
+                "without_points": int((points == 0).sum()),
+                "outside_range": report.by_class[name].outside,
+                "median_points": float(np.median(points)),
+                "median_size": np.median(boxes[:, 3:6], axis=0).round(2).tolist(),
+                "median_z": float(np.median(boxes[:, 2]).round(2)),
+                "median_gap": None if np.isnan(gap).all() else float(np.nanmedian(gap).round(2)),
+                "farthest": float(distance.max().round(1)),
+            }
+        )
+    return rows
+
+
+def warnings(report: DataReport, ground: float | None = None) -> list[str]:
+    """Say what looks wrong, the gravest first.
+
+    Args:
+        report: what was found.
+        ground: height of the ground that the description of the data set promises, where it does.
+    """
+    out = [f"cannot be read: {message}" for message in report.unreadable[:5]]
+    if len(report.unreadable) > 5:
+        out.append(f"cannot be read: {len(report.unreadable) - 5} more frames")
+    out += _frames_that("have no point", report.without_points, report.frames)
+    out += _frames_that("have no label file", report.unlabelled, report.frames)
+    out += _frames_that("are labelled and have no box", report.without_boxes, report.frames)
+    if report.intensity:
+        low, high = min(low for low, _ in report.intensity), max(high for _, high in report.intensity)
+        if high > 1 or low < 0:
+            out.append(f"intensity runs from {low:g} to {high:g}; networks expect 0 to 1: set intensity_scale")
+        elif high == 0:
+            out.append("intensity is 0 everywhere; train without it, or look whether another column holds it")
+    for row in class_rows(report):
+        out += _class_warnings(report, row)
+    if ground is not None and report.ground and abs(np.median(report.ground) - ground) > FLOATING:
+        wrong = float(np.median(report.ground)) - ground
+        out.append(
+            f"the ground lies {abs(wrong):.2f} m {'above' if wrong > 0 else 'below'} where sensor_height puts it"
+        )
+    return out
+
+
+def _frames_that(what: str, names: Sequence[str], frames: int) -> list[str]:
+    if not names:
+        return []
+    some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return [f"{len(names)} of {frames} frames {what}: {some}"]
+
+
+def _class_warnings(report: DataReport, row: dict[str, Any]) -> Iterator[str]:
+    name, total = row["name"], row["boxes"]
+    facts = report.by_class[name].joined()
+    if row["without_points"]:
+        yield f"{name}: {row['without_points']} of {total} boxes hold no point; min_points: 1 leaves them out"
+    if row["outside_range"]:
+        yield f"{name}: {row['outside_range']} of {total} boxes lie outside the range"
+    boxes, here, gap = facts.boxes, facts.as_labelled, facts.gap
+    length, width = np.median(boxes[:, 3]), np.median(boxes[:, 4])
+    if length < 0.8 * width:
+        yield f"{name}: length {length:.2f} m is less than width {width:.2f} m; are l and w swapped?"
+    long = (np.maximum(boxes[:, 3], boxes[:, 4]) > 1.4 * np.minimum(boxes[:, 3], boxes[:, 4])) & _telling(facts)
+    better = facts.across[long] > 1.1 * here[long]
+    if long.sum() >= FEW_BOXES and better.mean() > MANY:
+        yield (
+            f"{name}: {int(better.sum())} of {int(long.sum())} boxes hold more points when turned by 90 degrees; "
+            "is yaw 0 along y, or are l and w swapped?"
+        )
+    else:
+        slanted = long & (np.abs(np.sin(2 * boxes[:, 6])) > 0.5)
+        better = facts.mirrored[slanted] > 1.1 * here[slanted]
+        if slanted.sum() >= FEW_BOXES and better.mean() > MANY:
+            yield (
+                f"{name}: {int(better.sum())} of {int(slanted.sum())} slanted boxes hold more points with the opposite "
+                "heading; does yaw grow clockwise?"
+            )
+    known = gap[~np.isnan(gap)]
+    if len(known) >= FEW_BOXES and abs(np.median(known)) > FLOATING:
+        yield _floating(name, float(np.median(known)), float(np.median(boxes[:, 5])))
+
+
+def _telling(facts: BoxFacts) -> np.ndarray:
+    return np.maximum(facts.as_labelled, np.maximum(facts.across, facts.mirrored)) >= TELLING_POINTS
+
+
+def _floating(name: str, gap: float, height: float) -> str:
+    where = f"{abs(gap):.2f} m {'above' if gap > 0 else 'below'} the ground"
+    hint = ""
+    if abs(abs(gap) - height / 2) < 0.25 * height:
+        hint = f"; is z the {'lower' if gap < 0 else 'upper'} face instead of the centre?"
+    return f"{name}: boxes stand {where}{hint}"
+
+
+def report_text(report: DataReport, ground: float | None = None) -> str:
+    """Write the report."""
+    counts = report.point_counts or [0]
+    lines = [f"{report.frames} frames, {int(np.median(counts))} points a frame (from {min(counts)} to {max(counts)})"]
+    if report.ground:
+        lines.append(f"ground under the origin at z = {np.median(report.ground):.2f} m")
+    lines += [f"{number} frames: {note}" for note, number in report.notes.items()]
+    head = f"{'class':<18}{'boxes':>7}{'frames':>7}{'empty':>7}{'outside':>8}{'points':>8}{'l':>7}{'w':>6}{'h':>6}"
+    lines += ["", head + f"{'z':>7}{'gap':>7}{'far':>7}"]
+    for row in class_rows(report):
+        gap = "-" if row["median_gap"] is None else f"{row['median_gap']:.2f}"
+        length, width, height = row["median_size"]
+        lines.append(
+            f"{row['name']:<18}{row['boxes']:>7}{row['frames']:>7}{row['without_points']:>7}{row['outside_range']:>8}"
+            f"{row['median_points']:>8.0f}{length:>7.2f}{width:>6.2f}{height:>6.2f}{row['median_z']:>7.2f}{gap:>7}"
+            f"{row['farthest']:>7.1f}"
+        )
+    lines += [
+        "(metres; empty: boxes without a point; points, l, w, h, z, gap: medians; gap: from the ground up to the box)",
+        "",
+    ]
+    found = warnings(report, ground)
+    lines += [f"! {line}" for line in found] if found else ["nothing looks wrong"]
+    return "\n".join(lines) + "\n"
+
+
+def report_json(report: DataReport, ground: float | None = None) -> dict[str, Any]:
+    """Return the report as plain values."""
+    return {
+        "frames": report.frames,
+        "unreadable": report.unreadable,
+        "unlabelled": report.unlabelled,
+        "without_points": report.without_points,
+        "without_boxes": report.without_boxes,
+        "ground": float(np.median(report.ground)) if report.ground else None,
+        "classes": class_rows(report),
+        "warnings": warnings(report, ground),
+    }

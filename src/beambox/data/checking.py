@@ -1,0 +1,193 @@
+"""Read a whole data set and say what looks wrong before anything is trained on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beambox.checks import BeamboxError
+from beambox.data.source import FrameSource
+from beambox.ops.points_in_boxes import points_in_boxes_mask
+from beambox.structures import Frame
+
+__all__ = ["BoxFacts", "ClassFacts", "DataReport", "check_frames", "inspect_boxes"]
+
+Floats = NDArray[np.float64]
+TELLING_POINTS = 20
+"""Boxes with fewer points around them say nothing about their heading."""
+MARGIN = 0.1
+"""Boxes are widened by this much on all sides when their heading is looked at, metres."""
+NEARBY = 2.0
+"""Points this far around a box tell where the ground is, metres."""
+FLOATING = 0.5
+"""A class whose boxes stand this far from the ground is reported, metres."""
+
+
+@dataclass(frozen=True)
+class BoxFacts:
+    """What is known of each labelled box; M boxes."""
+
+    boxes: Floats
+    """``(M, 7)``."""
+    points: NDArray[np.int64]
+    """``(M,)`` points inside."""
+    gap: Floats
+    """``(M,)`` lower face less the ground nearby, metres; NaN where no ground is seen."""
+    as_labelled: NDArray[np.int64]
+    """``(M,)`` points inside the widened box."""
+    across: NDArray[np.int64]
+    """``(M,)`` points inside the box turned by 90 degrees."""
+    mirrored: NDArray[np.int64]
+    """``(M,)`` points inside the box turned the other way round: heading clockwise instead of counter-clockwise."""
+
+    def only(self, rows: NDArray[np.bool_]) -> BoxFacts:
+        """Keep some of the boxes."""
+        return BoxFacts(
+            self.boxes[rows],
+            self.points[rows],
+            self.gap[rows],
+            self.as_labelled[rows],
+            self.across[rows],
+            self.mirrored[rows],
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence[BoxFacts]) -> BoxFacts:
+        """Put the boxes of several frames in one row."""
+        return cls(
+            np.concatenate([part.boxes for part in parts]),
+            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.gap for part in parts]),
+            np.concatenate([part.as_labelled for part in parts]),
+            np.concatenate([part.across for part in parts]),
+            np.concatenate([part.mirrored for part in parts]),
+        )
+
+
+def inspect_boxes(frame: Frame) -> BoxFacts:
+    """Look at the points in and around each labelled box of a frame."""
+    assert frame.labels is not None
+    boxes = frame.labels.boxes.double()
+    xyz = frame.points[:, :3].double()
+    wide = boxes.clone()
+    wide[:, 3:6] += 2 * MARGIN
+    turned, flipped = wide.clone(), wide.clone()
+    turned[:, 6] += math.pi / 2
+    flipped[:, 6] *= -1
+    counts = [points_in_boxes_mask(xyz, each).sum(dim=1).numpy() for each in (boxes, wide, turned, flipped)]
+    return BoxFacts(boxes.numpy(), counts[0], _gaps(xyz.numpy(), boxes.numpy()), *counts[1:])
+
+
+def _gaps(xyz: Floats, boxes: Floats) -> Floats:
+    """Return how far each box's lower face lies above the low points around it."""
+    gaps = np.full(len(boxes), np.nan)
+    for k, box in enumerate(boxes):
+        reach = np.hypot(box[3], box[4]) / 2 + NEARBY
+        near = (np.abs(xyz[:, 0] - box[0]) < reach) & (np.abs(xyz[:, 1] - box[1]) < reach)
+        heights = xyz[near, 2]
+        heights = heights[np.abs(heights - box[2]) < box[5] + 3]
+        if len(heights) >= TELLING_POINTS:
+            gaps[k] = box[2] - box[5] / 2 - np.percentile(heights, 5)
+    return gaps
+
+
+@dataclass
+class ClassFacts:
+    """What is known of one class's boxes."""
+
+    parts: list[BoxFacts] = field(default_factory=list)
+    """One entry a frame that has the class."""
+    outside: int = 0
+    """Boxes outside the range."""
+
+    def joined(self) -> BoxFacts:
+        """Return all boxes in one row."""
+        return BoxFacts.join(self.parts)
+
+
+@dataclass
+class DataReport:
+    """What :func:`check_frames` found."""
+
+    frames: int = 0
+    """Frames looked at."""
+    unlabelled: list[str] = field(default_factory=list)
+    """Frames without a label file."""
+    without_points: list[str] = field(default_factory=list)
+    """Frames without a point."""
+    without_boxes: list[str] = field(default_factory=list)
+    """Labelled frames without a box."""
+    unreadable: list[str] = field(default_factory=list)
+    """What could not be read, one message a frame."""
+    point_counts: list[int] = field(default_factory=list)
+    """Points of each frame."""
+    ground: list[float] = field(default_factory=list)
+    """Height of the fitted ground under the origin, where one was found."""
+    intensity: list[tuple[float, float]] = field(default_factory=list)
+    """Lowest and highest intensity of each frame."""
+    notes: dict[str, int] = field(default_factory=dict)
+    """What reading had to decide, and in how many frames."""
+    by_class: dict[str, ClassFacts] = field(default_factory=dict)
+    """Facts of each class."""
+
+    def add(self, frame: Frame, limits: Sequence[float] | None) -> None:
+        """Take a frame into account.
+
+        Args:
+            frame: with everything that its files hold.
+            limits: x0, y0, x1, y1 of the data set's range.
+        """
+        self.frames += 1
+        self.point_counts.append(len(frame))
+        for note in frame.notes:
+            told = "".join("#" if letter.isdigit() else letter for letter in note)
+            self.notes[told] = self.notes.get(told, 0) + 1
+        if len(frame):
+            values = frame.points[:, 3]
+            self.intensity.append((float(values.min()), float(values.max())))
+        else:
+            self.without_points.append(frame.id)
+        if frame.plane is not None:
+            self.ground.append(float(-frame.plane[3] / frame.plane[2]))
+        if frame.labels is None:
+            self.unlabelled.append(frame.id)
+            return
+        if not len(frame.labels):
+            self.without_boxes.append(frame.id)
+            return
+        facts = inspect_boxes(frame)
+        names = np.array(frame.labels.names)
+        x, y = facts.boxes[:, 0], facts.boxes[:, 1]
+        low_x, low_y, high_x, high_y = limits or (-np.inf, -np.inf, np.inf, np.inf)
+        inside = (x >= low_x) & (x < high_x) & (y >= low_y) & (y < high_y)
+        for name in dict.fromkeys(frame.labels.names):
+            rows = names == name
+            held = self.by_class.setdefault(name, ClassFacts())
+            held.parts.append(facts.only(rows))
+            held.outside += int((rows & ~inside).sum())
+
+
+def check_frames(
+    source: FrameSource, indices: Iterable[int] | None = None, limits: Sequence[float] | None = None
+) -> DataReport:
+    """Read frames one after another and collect what is to be said about them.
+
+    Args:
+        source: the data set.
+        indices: which frames; None takes all.
+        limits: x0, y0, x1, y1 of the range, where there is one.
+    """
+    report = DataReport()
+    for index in range(len(source)) if indices is None else indices:
+        try:
+            frame = source[index]
+        except BeamboxError as error:
+            report.frames += 1
+            report.unreadable.append(str(error))
+            continue
+        report.add(frame, limits)
+    return report
