@@ -1,4 +1,4 @@
-"""A folder of your own recordings, without any description: sweeps of any format, and boxes as plain text in the LiDAR's frame.
+"""A folder of your own, without a description: sweeps of any format, and boxes as text in the LiDAR's frame.
 
 .. code-block:: text
 

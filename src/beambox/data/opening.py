@@ -15,8 +15,7 @@ __all__ = ["open_data"]
 
 
 def open_data(path: Path | str, split: str = "val", *, fov: bool = False) -> FrameSource:
-    """Open a data set: a YAML file that describes one, or a folder in KITTI's or ONCE's layout
-    or with points/ and labels/.
+    """Open a data set: a YAML file that describes one, a folder in KITTI's or ONCE's layout, or points/ and labels/.
 
     Args:
         path: the file or folder.
