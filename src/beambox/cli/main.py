@@ -17,6 +17,10 @@ __all__ = ["COMMANDS", "main"]
 
 # name -> (module:function, or module:app for a command with commands of its own; what it does in one line)
 COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": (
+        "beambox.cli.demo:command",
+        "simulate a few sweeps, detect, score, draw: under a minute, nothing else needed",
+    ),
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns"),
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
@@ -26,6 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
     "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
     "data": ("beambox.cli.data:app", "check a data set of one's own before training, and propose anchors for it"),
+    "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),
     "score": ("beambox.cli.score:app", "score result files of any detector by the rules of KITTI or ONCE"),
 }
 

@@ -138,16 +138,20 @@ class Detector:
         return frame
 
     def prepare(self, frame: Frame) -> Frame:
-        """Crop to the view, correct, and keep the columns the network takes."""
-        frame = self.corrections.apply(self.crop(frame))
-        inside = self.grid.index(frame.points)[1]
-        if len(frame) and not bool(inside.any()):
+        """Crop to the view and correct."""
+        return self.corrections.apply(self.crop(frame))
+
+    def sees(self, prepared: Frame) -> bool:
+        """Tell whether any point lies where the network looks; warns where points are there, but none does."""
+        if bool(self.grid.index(prepared.points)[1].any()):
+            return True
+        if len(prepared):
             log.warning(
                 "%s: none of its %d points lies in the region the network looks at; beambox doctor says why",
-                frame.id or "sweep",
-                len(frame),
+                prepared.id or "sweep",
+                len(prepared),
             )
-        return frame
+        return False
 
     def crop(self, frame: Frame) -> Frame:
         """Drop the points outside the camera's view where only that is looked at."""
@@ -161,9 +165,15 @@ class Detector:
 
     @torch.inference_mode()
     def detect(self, frames: Sequence[Frame]) -> list[Detections]:
-        """Detect in frames that pass through the network together."""
-        batch = Batch.of([self.prepare(frame) for frame in frames])
-        return self.finish(self.predict(batch.to(self.device)), frames)
+        """Detect in frames that pass through the network together; where there is no point, there is nothing."""
+        prepared = [self.prepare(frame) for frame in frames]
+        seen = [k for k, frame in enumerate(prepared) if self.sees(frame)]
+        found = [Detections.empty(self.classes, frame.id) for frame in frames]
+        if seen:
+            batch = Batch.of([prepared[k] for k in seen]).to(self.device)
+            for k, one in zip(seen, self.finish(self.predict(batch), [frames[k] for k in seen])):
+                found[k] = one
+        return found
 
     @torch.inference_mode()
     def predict(self, batch: Batch) -> Any:

@@ -1,0 +1,84 @@
+"""`beambox bench`: how long detection takes, stage by stage."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from beambox.checks import BeamboxError, did_you_mean
+from beambox.cli import options
+from beambox.cli.console import announce, say, show_log
+
+__all__ = ["command"]
+
+
+def command(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="Shipped name, .safetensors file, or folder of a run.")],
+    inputs: Annotated[
+        list[str] | None, typer.Argument(metavar="[INPUT]...", help="Sweeps; one simulated if none.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, help="Passes that count.")] = 50,
+    warmup: Annotated[int, typer.Option(min=0, help="Passes before them.")] = 20,
+    batch: Annotated[int, typer.Option(min=1, help="Sweeps in one pass.")] = 1,
+    threads: Annotated[int, typer.Option(min=0, help="Threads of the CPU; 0 leaves torch's choice.")] = 0,
+    protocol: Annotated[
+        str, typer.Option(help="stages, or kassd: three parts, mean of ten runs, as in its Table 7.")
+    ] = "stages",
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="Write the numbers here.")] = None,
+    range_: options.RangeOption = "",
+    device: options.DeviceOption = "auto",
+    precision: options.PrecisionOption = "auto",
+) -> None:
+    """Measure latency: load, voxelise, network, post-process; percentiles, throughput, peak memory.
+
+    Examples:
+      beambox bench pointpillars-sim
+      beambox bench run/best.safetensors kitti/training/velodyne/000008.bin --threads 2 --json bench.json
+      beambox bench pointpillars-sim --protocol kassd
+    """
+    import json
+    import tempfile
+
+    import torch
+
+    from beambox.data.files import write_text
+    from beambox.infer.benchmark import measure
+    from beambox.infer.inputs import find_sweeps
+    from beambox.infer.predictor import load
+
+    show_log()
+    if protocol not in ("stages", "kassd"):
+        raise BeamboxError(f'unknown protocol "{protocol}"{did_you_mean(protocol, ["stages", "kassd"])}')
+    if threads:
+        torch.set_num_threads(threads)
+    detector = load(model, device=device, precision=precision, range=options.parse_range(range_))
+    announce("bench", detail=model, seed=None if inputs else 0)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [sweep.path for sweep in find_sweeps(inputs)] if inputs else [simulated_sweep(Path(folder))]
+        if protocol == "kassd":
+            runs, batch = 10, 1
+        report = measure(detector, paths, runs=runs, warmup=warmup, batch=batch, name=model)
+    told = report.setting
+    print(
+        f"{model} on {told['device']}, {told['precision']}, {told['threads']} threads, batch {told['batch']}, "
+        f"{told['points']:,} points, {told['runs']} runs after {told['warmup']}"
+    )
+    print(report.kassd_table() if protocol == "kassd" else report.table())
+    load_average, cores = told["load_average"], os.cpu_count() or 1
+    if load_average is not None and load_average > 0.5 * cores:
+        say(f"the machine was busy (load {load_average} on {cores} cores): these times are too long")
+    if json_file is not None:
+        write_text(json_file, json.dumps(report.to_json(), indent=2) + "\n")
+
+
+def simulated_sweep(folder: Path) -> Path:
+    """Simulate a sweep of the front view and write it with its calibration."""
+    from beambox.data.kitti import write_kitti_frame
+    from beambox.simulate import simulate_frame
+
+    frame = simulate_frame(0, 0)
+    write_kitti_frame(folder, frame)
+    return folder / "training" / "velodyne" / f"{frame.id}.bin"

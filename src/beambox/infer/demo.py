@@ -1,0 +1,80 @@
+"""The whole chain on a few simulated sweeps: simulate, detect, score, draw."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from beambox.data.files import write_text
+from beambox.data.kitti import write_kitti_frame, write_split
+from beambox.infer.predictor import Detector
+from beambox.infer.results import write_results
+from beambox.metrics.kitti import KittiFrame, evaluate
+from beambox.metrics.kitti_result import KittiResult
+from beambox.simulate import SimulatedSource
+from beambox.visualise.canvas import save_picture
+from beambox.visualise.picture import draw_sweep
+
+__all__ = ["Demo", "run_demo"]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What a demonstration left behind."""
+
+    scores: KittiResult
+    """Average precision of the sweeps."""
+    pictures: tuple[Path, ...]
+    """One picture a sweep."""
+    objects: int
+    """Number of objects in all sweeps."""
+    detections: int
+    """Number of detections in all sweeps."""
+
+
+def run_demo(
+    detector: Detector,
+    out: Path,
+    *,
+    frames: int,
+    seed: int,
+    sensor: str = "hdl64",
+    model: str = "",
+    tell: Callable[[str], None] = lambda _: None,
+) -> Demo:
+    """Simulate sweeps, detect in them, score and draw the detections.
+
+    Writes ``out/data`` (KITTI's layout), ``out/results`` (KITTI and JSON), ``out/pictures`` and ``out/scores.json``.
+
+    Args:
+        detector: weights for the simulated sensor.
+        out: folder; made where it is not there.
+        frames: number of sweeps.
+        seed: of the simulation.
+        sensor: of the simulation.
+        model: name of the weights, for the results.
+        tell: is given a line after each sweep.
+    """
+    source = SimulatedSource(frames, seed=seed, sensor=sensor)
+    scored, pictures, objects, found = [], [], 0, 0
+    for index in range(len(source)):
+        frame = source[index]
+        write_kitti_frame(out / "data", frame)
+        detections = detector(frame)
+        write_results(out / "results", frame, detections, ["kitti", "json"], model)
+        sure = detections[detections.scores >= 0.3]
+        picture = draw_sweep(frame, sure, frame.labels, title=f"Simulated sweep {frame.id}")
+        pictures.append(out / "pictures" / f"{frame.id}.png")
+        save_picture(picture, pictures[-1])
+        assert frame.labels is not None, "simulated frames are labelled"
+        scored.append(KittiFrame(frame.labels, detections, frame.calibration, frame.image_size or (1242, 375)))
+        objects += len(frame.labels)
+        found += len(sure)
+        tell(f"{frame.id}: {len(frame):,} points, {len(frame.labels)} objects, {len(sure)} found -> {pictures[-1]}")
+    write_split(out / "data", "val", source.ids)
+    scores = evaluate(scored, detector.classes)
+    write_text(out / "scores.txt", scores.table())
+    write_text(out / "scores.json", json.dumps(scores.to_json(), indent=2) + "\n")
+    return Demo(scores, tuple(pictures), objects, found)

@@ -1,0 +1,97 @@
+"""Another sensor's axes and height: what goes in turned comes out where it was."""
+
+from __future__ import annotations
+
+import math
+from itertools import permutations, product
+
+import pytest
+import torch
+
+from beambox.checks import BeamboxError
+from beambox.geometry import corners_bev
+from beambox.infer.corrections import Axes, Corrections
+from beambox.structures import Detections, Frame
+
+PAIRS = (("forward", "backward"), ("left", "right"), ("up", "down"))
+ALL = [Axes(*words) for order in permutations(PAIRS) for words in product(*order)]
+LEVEL = [axes for axes in ALL if axes.vertical_z]
+
+
+def detections(boxes: torch.Tensor) -> Detections:
+    return Detections(boxes, torch.ones(len(boxes)), torch.zeros(len(boxes), dtype=torch.int64), ("Car",))
+
+
+def test_there_are_48_frames_half_of_them_right_handed() -> None:
+    assert len(ALL) == 48
+    assert sum(axes.right_handed for axes in ALL) == 24
+
+
+@pytest.mark.parametrize("axes", ALL, ids=str)
+def test_matrix_is_orthonormal_and_says_where_the_axes_lead(axes: Axes) -> None:
+    assert torch.equal(axes.matrix @ axes.matrix.T, torch.eye(3, dtype=torch.float64))
+    forward = axes.matrix @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    wanted = {"forward": (1, 0, 0), "backward": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0)}
+    wanted |= {"up": (0, 0, 1), "down": (0, 0, -1)}
+    assert tuple(forward.tolist()) == wanted[axes.x]
+
+
+@pytest.mark.parametrize("axes", ALL, ids=str)
+def test_printed_axes_are_read_back(axes: Axes) -> None:
+    assert Axes.parse(str(axes)) == axes
+
+
+def test_z_completes_a_right_handed_frame() -> None:
+    assert Axes.parse("x: right, y: forward") == Axes("right", "forward", "up")
+    assert Axes.parse("X=forward Y=right") == Axes("forward", "right", "down")
+    assert Axes.parse("y: down, x: right") == Axes("right", "down", "forward")
+
+
+@pytest.mark.parametrize("text", ["", "x: right", "right, forward", "x: right, y: forward, x: left", "x: right, y: 3"])
+def test_axes_that_cannot_be_read_are_refused_with_an_example(text: str) -> None:
+    with pytest.raises(BeamboxError, match='for example "x: right, y: forward"'):
+        Axes.parse(text)
+
+
+def test_axes_along_one_line_or_to_nowhere_are_refused() -> None:
+    with pytest.raises(BeamboxError, match="three different lines, got x: right, y: left"):
+        Axes.parse("x: right, y: left")
+    with pytest.raises(BeamboxError, match=r'unknown direction "forwards" in axes \(did you mean "forward"\?\)'):
+        Axes.parse("x: forwards, y: left")
+
+
+@pytest.mark.parametrize("axes", LEVEL, ids=str)
+def test_boxes_stay_around_their_points(axes: Axes) -> None:
+    """A box found around turned points, carried back, has its corners at the given points."""
+    generator = torch.Generator().manual_seed(3)
+    boxes = torch.rand(5, 7, generator=generator, dtype=torch.float64) * 6 + 0.5
+    here = Corrections(axes, raise_by=0.4)
+    given_corners = corners_bev(boxes)  # (5, 4, 2), in the given frame
+    points = torch.cat((given_corners.reshape(-1, 2), torch.zeros(20, 2, dtype=torch.float64)), dim=1)
+    seen = here.apply(Frame(points.float())).points[:, :2].reshape(5, 4, 2)
+    found = corners_bev(here.carry_forward(boxes))
+    for a, b in zip(seen.double(), found):  # the order of corners turns round in a mirrored frame
+        assert torch.cdist(a, b).amin(dim=1).max() < 1e-4
+    back = here.carry_back(detections(here.carry_forward(boxes)))
+    assert torch.allclose(back.boxes[:, :6], boxes[:, :6])
+    turn = (back.boxes[:, 6] - boxes[:, 6] + math.pi) % (2 * math.pi) - math.pi
+    assert turn.abs().max() < 1e-9
+
+
+def test_height_moves_points_up_and_boxes_back_down() -> None:
+    corrections = Corrections(raise_by=0.5)
+    frame = Frame(torch.tensor([[1.0, 2.0, -2.23, 0.5]]))
+    assert corrections.apply(frame).points[0, 2] == pytest.approx(-1.73)
+    assert frame.points[0, 2] == pytest.approx(-2.23), "the given points are not changed"
+    assert corrections.carry_back(detections(torch.ones(1, 7))).boxes[0, 2] == pytest.approx(0.5)
+
+
+def test_boxes_of_points_with_a_lying_z_stay_in_the_usual_frame() -> None:
+    camera = Corrections(Axes("right", "down", "forward"))
+    boxes = torch.tensor([[10.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.3]])
+    assert torch.equal(camera.carry_back(detections(boxes)).boxes, boxes)
+
+
+def test_no_correction_is_no_change() -> None:
+    frame = Frame(torch.rand(3, 4))
+    assert Corrections().apply(frame) is frame
