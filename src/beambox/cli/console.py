@@ -42,8 +42,13 @@ def show_log(level: int = logging.WARNING) -> None:
     """Let the library's log appear on stderr, one line a record."""
     logger = logging.getLogger("beambox")
     logger.setLevel(level)
-    if not logger.handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("beambox: %(message)s"))
-        logger.addHandler(handler)
-        logger.propagate = False
+    if not any(isinstance(handler, _Lines) for handler in logger.handlers):
+        logger.addHandler(_Lines())
+
+
+class _Lines(logging.Handler):
+    """One line on stderr, whatever stderr is by then."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a record."""
+        say(f"beambox: {record.getMessage()}")

@@ -35,12 +35,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 EXAMPLES = (
-    ("beambox demo", "simulate, detect, score and draw: needs nothing but this package"),
+    ("beambox demo", "simulate, detect, score, draw: needs no data"),
     ("beambox detect scan.bin --model pointpillars-sim", "find objects in a sweep: writes scan.json"),
     ("beambox show scan.bin --model pointpillars-sim --out scan.png", "and look at them"),
     ("beambox doctor scan.bin", "why are there no detections?"),
     ("beambox simulate data --frames 200 --seed 1", "make a labelled data set"),
-    ("beambox train recipes/pointpillars_sim.yaml --data data --out run", "train on it"),
+    ("beambox train recipes/pointpillars_small.yaml --data data --out run", "train on it"),
     ("beambox evaluate run --data data", "and score the result"),
 )
 

@@ -26,9 +26,9 @@ __all__ = ["command"]
 
 def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     inputs: options.InputsArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture (.png, .jpg); a folder for several.")] = Path(
-        "show.png"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Picture (.png, .jpg) or page (.html); a folder for several.")
+    ] = Path("show.png"),
     model: Annotated[str, typer.Option("--model", "-m", metavar="M", help="Detect with these weights.")] = "",
     results: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Draw these detections (json, csv, KITTI).")
@@ -52,13 +52,17 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
       beambox show scan.bin --model pointpillars-sim --out scan.png
       beambox show kitti/training/velodyne/000008.bin --out truth.png
       beambox show kitti/training/velodyne --results results --out pictures
+      beambox show scan.bin --model pointpillars-sim --out scan.html
 
-    Labels and camera image are found beside a sweep in KITTI's layout (../label_2, ../image_2).
+    Labels and camera image are found beside a sweep in KITTI's layout (../label_2, ../image_2). A page (.html) shows
+    points and boxes in three dimensions in any browser, and needs no other file.
     """
+    from beambox.data.files import write_text
     from beambox.infer.corrections import Axes
     from beambox.infer.inputs import find_sweeps, read_sweep
     from beambox.infer.predictor import load
     from beambox.visualise.canvas import save_picture
+    from beambox.visualise.viewer import viewer_html
 
     show_log()
     check_choices(colour, model, results)
@@ -86,8 +90,11 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         if detections is not None:
             detections = detections[detections.scores >= min_score]
         frame = frame if detector is None else detector.crop(frame)
-        picture = picture_of(frame, detections, truth, detector, turned, shown, colour)
-        save_picture(picture, path)
+        frame, detections, truth = forward_up(frame, detections, truth, turned)
+        if path.suffix == ".html":
+            write_text(path, viewer_html(frame, detections, truth))
+        else:
+            save_picture(picture_of(frame, detections, truth, detector, shown, colour), path)
         print(f"{sweep.name} -> {path}")
 
 
@@ -113,6 +120,8 @@ def region_of_option(area: str) -> Region | None:
 
 def picture_paths(sweeps: list[Sweep], out: Path) -> list[Path]:
     """Return where each picture goes: the named file for one sweep, files in the named folder for several."""
+    if out.suffix and out.suffix.lower() not in (".png", ".jpg", ".jpeg", ".html"):
+        raise BeamboxError(f"a picture is written as .png, .jpg or .html, got the name {out}")
     if len(sweeps) == 1 and out.suffix:
         return [out]
     if out.suffix:
@@ -150,25 +159,34 @@ def found_in(frame: Frame, detector: Detector | None, results: Path | None) -> D
     return read_result(path, frame)
 
 
+def forward_up(
+    frame: Frame, detections: Detections | None, truth: Labels | None, axes: Axes
+) -> tuple[Frame, Detections | None, Labels | None]:
+    """Turn points of other axes to x forward, y left, z up, and the boxes with them."""
+    from beambox.infer.corrections import Corrections
+
+    turn = Corrections(axes)
+    if turn.nothing:
+        return frame, detections, truth
+    return (
+        replace(turn.apply(frame), image_path=None),  # the camera knows the points' own axes only
+        detections and replace(detections, boxes=turn.carry_forward(detections.boxes)),
+        truth and truth.with_boxes(turn.carry_forward(truth.boxes)),
+    )
+
+
 def picture_of(
     frame: Frame,
     detections: Detections | None,
     truth: Labels | None,
     detector: Detector | None,
-    axes: Axes,
     shown: Region | None,
     colour: str,
 ) -> Image:
-    """Draw with forward upwards, whatever the axes of the points are."""
-    from beambox.infer.corrections import Corrections
+    """Draw, with the detector's region where there is one."""
     from beambox.visualise.bev import Region
     from beambox.visualise.picture import draw_sweep
 
-    turn = Corrections(axes)
-    if not turn.nothing:  # the camera knows the points' own axes only
-        frame = replace(turn.apply(frame), image_path=None)
-        detections = detections and replace(detections, boxes=turn.carry_forward(detections.boxes))
-        truth = truth and truth.with_boxes(turn.carry_forward(truth.boxes))
     looked_at = None
     if detector is not None:
         (x0, y0, _), (x1, y1, _) = detector.grid.minimum, detector.grid.maximum
