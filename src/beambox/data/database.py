@@ -19,6 +19,7 @@ from beambox.ops.points_in_boxes import points_in_boxes_mask
 __all__ = ["ObjectDatabase"]
 
 FORMAT = "beambox objects 1"
+OBJECTS = 2  # stream of random numbers; those of the loader are 0 and 1
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class ObjectDatabase:
         count = min(count, len(members))
         if count == 0:
             return np.zeros(0, dtype=np.int64)
-        return np.unique(members[walk(len(members), turn * count, count, (seed, kind))])
+        return np.unique(members[walk(len(members), turn * count, count, (seed, OBJECTS, kind))])
 
     def sample(
         self, existing: np.ndarray, wanted: Sequence[tuple[str, int]], turn: int, seed: int

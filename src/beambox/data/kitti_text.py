@@ -32,6 +32,8 @@ __all__ = [
 DONT_CARE = "DontCare"
 LABEL_COLUMNS = 15
 RESULT_COLUMNS = 16
+FARTHEST = 1e6
+"""No number of a label file is larger than this."""
 CALIBRATION_REMEDY = "boxes live in the camera's frame, so labels and the camera's view need it; points alone do not"
 # the object benchmark's key first, then those of the tracking benchmark and of the raw recordings
 CALIBRATION_KEYS = {
@@ -69,7 +71,12 @@ def parse_calibration(text: str, where: str = "calibration") -> Calibration:
                 f"{where}, line {number}: expected {math.prod(shape)} numbers for `{found}`, got {len(values)}"
             )
         matrices.append(torch.tensor(values, dtype=torch.float64).reshape(shape))
-    return Calibration(*matrices)
+    calibration = Calibration(*matrices)
+    if float(torch.linalg.det(calibration.r0 @ calibration.velo_to_cam[:, :3]).abs()) < 1e-6:
+        raise BeamboxError(
+            f"{where}: expected rotations in `R0_rect` and `Tr_velo_to_cam`, got matrices without inverse"
+        )
+    return calibration
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -233,6 +240,8 @@ def _parse_rows(text: str, where: str, columns: tuple[int, ...]) -> _Rows:
         if len(words) not in columns:
             raise BeamboxError(f"{place}: expected {wanted} columns, got {len(words)}")
         values = _numbers(words[1:], place)
+        if max(map(abs, values)) > FARTHEST:
+            raise BeamboxError(f"{place}: expected metres, pixels and radians, got {max(values, key=abs):g}")
         if words[0] == DONT_CARE:
             ignored.append(values[3:7])
             continue

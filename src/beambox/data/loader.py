@@ -24,7 +24,7 @@ from beambox.structures import Batch, Frame
 
 __all__ = ["FrameLoader", "MixedSource", "epoch_order", "prepare_frame"]
 
-ORDER, AUGMENT, OBJECTS = 0, 1, 2  # streams of random numbers that must not meet
+ORDER, AUGMENT = 0, 1  # streams of random numbers that must not meet; the object database has 2
 REPLACEMENTS = 10
 Key = tuple[int, int, int]  # epoch, position in its order, number of the frame
 
