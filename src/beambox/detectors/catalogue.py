@@ -11,6 +11,7 @@ from torch import nn
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.detectors.hcnet import HCNetConfig, hcnet
+from beambox.detectors.kassd import KassdConfig, kassd
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
 from beambox.detectors.second import SecondConfig, second
 from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
@@ -28,6 +29,7 @@ class CatalogueEntry:
 
 CATALOGUE: dict[str, CatalogueEntry] = {
     "hcnet": CatalogueEntry(HCNetConfig, hcnet),
+    "kassd": CatalogueEntry(KassdConfig, kassd),
     "pointpillars": CatalogueEntry(PointPillarsConfig, pointpillars),
     "second": CatalogueEntry(SecondConfig, second),
     "voxel_rcnn": CatalogueEntry(VoxelRcnnConfig, voxel_rcnn),

@@ -17,7 +17,15 @@ from beambox.layers.coders import decode_boxes, direction_bin, encode_boxes, res
 from beambox.layers.losses import sigmoid_focal, sine_difference, smooth_l1
 from beambox.ops.nms import nms
 
-__all__ = ["AnchorHead", "AnchorPredictions", "LossWeights", "PostProcess", "anchor_loss", "select_boxes"]
+__all__ = [
+    "AnchorHead",
+    "AnchorPredictions",
+    "LossWeights",
+    "PostProcess",
+    "anchor_loss",
+    "best_anchors",
+    "select_boxes",
+]
 
 
 @dataclass(frozen=True)
@@ -40,6 +48,12 @@ class AnchorPredictions:
         boxes = decode_boxes(self.box.float(), self.anchors)
         yaw = resolve_heading(boxes[..., 6], self.direction.argmax(dim=-1))
         return torch.cat((boxes[..., :6], yaw[..., None]), dim=-1)
+
+    def decoded_rows(self, sample: int, rows: Tensor) -> Tensor:
+        """Boxes of some anchors of one sample with resolved headings: ``(M,)`` int64 -> ``(M, 7)`` float32."""
+        boxes = decode_boxes(self.box[sample, rows].float(), self.anchors[rows])
+        yaw = resolve_heading(boxes[:, 6], self.direction[sample, rows].argmax(dim=-1))
+        return torch.cat((boxes[:, :6], yaw[:, None]), dim=1)
 
 
 @dataclass(frozen=True)
@@ -150,6 +164,22 @@ def anchor_loss(
     return {"cls": weights.cls * cls, "loc": weights.loc * loc, "direction": weights.direction * direction}
 
 
+def best_anchors(
+    predictions: AnchorPredictions, sample: int, threshold: float, limit: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the anchors of one sample whose best class scores at least ``threshold``; of more than ``limit`` the best.
+
+    Returns:
+        Rows ``(M,)`` int64, scores ``(M,)`` float32 and class positions ``(M,)`` int64, in no particular order.
+    """
+    score, label = predictions.cls[sample].float().max(dim=-1)
+    score = torch.sigmoid(score)
+    rows = torch.nonzero(score >= threshold)[:, 0]
+    if len(rows) > limit:
+        rows = rows[torch.topk(score[rows], limit).indices]
+    return rows, score[rows], label[rows]
+
+
 def select_boxes(predictions: AnchorPredictions, options: PostProcess) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Keep the good boxes of each sample: threshold, the best ``nms_pre``, class-agnostic rotated suppression.
 
@@ -158,14 +188,8 @@ def select_boxes(predictions: AnchorPredictions, options: PostProcess) -> list[t
     """
     kept = []
     for sample in range(len(predictions.cls)):
-        score, label = predictions.cls[sample].float().max(dim=-1)
-        score = torch.sigmoid(score)
-        candidate = torch.nonzero(score >= options.score_threshold)[:, 0]
-        if len(candidate) > options.nms_pre:
-            candidate = candidate[torch.topk(score[candidate], options.nms_pre).indices]
-        boxes = decode_boxes(predictions.box[sample, candidate].float(), predictions.anchors[candidate])
-        yaw = resolve_heading(boxes[:, 6], predictions.direction[sample, candidate].argmax(dim=-1))
-        boxes = torch.cat((boxes[:, :6], yaw[:, None]), dim=1)
-        keep = nms(boxes, score[candidate], options.nms_iou, options.nms_pre, options.nms_post)
-        kept.append((boxes[keep], score[candidate][keep], label[candidate][keep]))
+        rows, score, label = best_anchors(predictions, sample, options.score_threshold, options.nms_pre)
+        boxes = predictions.decoded_rows(sample, rows)
+        keep = nms(boxes, score, options.nms_iou, options.nms_pre, options.nms_post)
+        kept.append((boxes[keep], score[keep], label[keep]))
     return kept
