@@ -89,7 +89,10 @@ def scored_frames(found: Iterable[tuple[Frame, Detections]]) -> list[KittiFrame]
 
 
 def score_frames(
-    frames: Sequence[KittiFrame], classes: Sequence[str] | None = None, iou: Mapping[str, float] | None = None
+    frames: Sequence[KittiFrame],
+    classes: Sequence[str] | None = None,
+    iou: Mapping[str, float] | None = None,
+    levels: bool = True,
 ) -> KittiResult:
     """Score frames by KITTI's rules, by difficulty where all have a camera and all objects together where one lacks it.
 
@@ -97,8 +100,9 @@ def score_frames(
         frames: from :func:`scored_frames`.
         classes: to score; None takes the detector's.
         iou: overlaps that count as found, by class, where they differ from KITTI's.
+        levels: False scores all objects together in any case.
     """
-    graded = all(
+    graded = levels and all(
         frame.calibration is not None and (frame.labels.attributes is not None or not len(frame.labels))
         for frame in frames
     )

@@ -135,8 +135,8 @@ class ValidationSection(Section):
     """Overlap in space or from above."""
     recalls: Literal["R40", "R11", "all"] = "R40"
     """Recall positions of the average precision; ``all`` suits sets with few objects."""
-    level: Literal["easy", "moderate", "hard"] = "moderate"
-    """KITTI's difficulty."""
+    level: Literal["easy", "moderate", "hard", "all"] = "moderate"
+    """KITTI's difficulty; ``all``: every object counts, as in data without a camera."""
     iou: dict[str, float] = {}
     """Overlap that counts as found, by class, where it differs from KITTI's."""
 
