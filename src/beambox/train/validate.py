@@ -44,7 +44,9 @@ class Validator:
                 f"{did_you_mean(self.section.choose_by, [*classes, 'mean'])}"
             )
         frames = scored_frames(detect_frames(network(model), self.source))
-        return summarise(score_frames(frames, classes, self.section.iou or None, self.section.level != "all"), self.section)
+        return summarise(
+            score_frames(frames, classes, self.section.iou or None, self.section.level != "all"), self.section
+        )
 
 
 def summarise(result: KittiResult, section: ValidationSection) -> Score:
