@@ -17,6 +17,7 @@ from beambox.metrics.kitti_result import AveragePrecision, ClassResult, KittiRes
 from beambox.train import ablation
 from beambox.train.ablation import Interrupted, merged, report, row_recipe, run_table, to_json, value_at
 from beambox.train.config import Recipe, parse_recipe, read_recipe
+from beambox.train.sources import open_source
 from beambox.train.tables import TABLES, Column, Row, Table, levels, table_of
 from oracles import tiny_training
 
@@ -49,12 +50,12 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Sources are frames in memory; returns the splits that were opened."""
     splits: list[str] = []
 
-    def open_source(section: Any, data: Path | None) -> FrameSource:
+    def in_memory(section: Any, data: Path | None) -> FrameSource:
         splits.append(section.split)
         return tiny_training.frames(3, seed=len(section.split))
 
-    monkeypatch.setattr("beambox.train.loop.open_source", open_source)
-    monkeypatch.setattr("beambox.train.ablation.open_source", open_source)
+    monkeypatch.setattr("beambox.train.loop.open_source", in_memory)
+    monkeypatch.setattr("beambox.train.ablation.open_source", in_memory)
     return splits
 
 
@@ -73,6 +74,23 @@ def test_every_row_is_trained_for_every_seed_and_nothing_twice(tmp_path: Path, o
     again = run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], said.append)
     assert again == measured
     assert opened[5:] == ["val"]
+
+
+def test_once_is_scored_by_its_own_rules(tmp_path: Path, opened: list[str]) -> None:
+    plain = tiny_recipe().model_dump(mode="python")
+    plain["validation"]["source"]["kind"] = "once"
+    columns = (Column("Vehicle", "overall", ("Vehicle", "overall")), Column("mAP", "overall", ("mean", "overall")))
+    table = replace(TINY, columns=columns, rows=(Row("plain", (60.0, 50.0), {}),))
+    ((run,),) = run_table(table, parse_recipe(plain), None, tmp_path, [0], lambda _: None).values()
+    scores = json.loads((tmp_path / "tiny" / "as-recipe" / "seed-0" / "scores.json").read_text())
+    assert set(scores) == {"Vehicle", "Pedestrian", "Cyclist", "mean"}
+    assert run == [scores["Vehicle"]["overall"], scores["mean"]["overall"]]
+
+
+def test_the_once_recipe_reads_the_layout_of_once(tmp_path: Path) -> None:
+    made = read_recipe(ROOT / "recipes" / "hcnet_once.yaml")
+    with pytest.raises(BeamboxError, match=r"train.txt is not there: no split .* ONCE's layout"):
+        open_source(made.data[0], tmp_path)
 
 
 def test_rows_of_a_seed_start_from_the_same_random_numbers(tmp_path: Path, opened: list[str]) -> None:

@@ -16,6 +16,7 @@ from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
 from beambox.detectors.weights import load_weights, write_atomically
 from beambox.infer.evaluate import detect_frames, network, score_frames, scored_frames
+from beambox.metrics import once
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.loop import FINAL, LAST, train
 from beambox.train.sources import open_source
@@ -135,12 +136,14 @@ def claim(folder: Path, identity: dict[str, Any]) -> None:
 
 
 def score(model: Any, source: FrameSource, recipe: Recipe) -> dict[str, Any]:
-    """Score a detector by KITTI's rules."""
+    """Score a detector by the rules of its data: ONCE's for ONCE, else KITTI's."""
     import torch
 
     assert recipe.validation is not None
     model = model.to("cuda" if torch.cuda.is_available() else "cpu")
     frames = scored_frames(detect_frames(network(model), source))
+    if recipe.validation.source.kind == "once":
+        return once.evaluate([(frame.labels, frame.detections) for frame in frames]).to_json()
     return score_frames(frames, model.config.classes, recipe.validation.iou or None).to_json()
 
 

@@ -54,7 +54,7 @@ class DetectorSection(Section):
 class SourceSection(Section):
     """One set of frames."""
 
-    kind: Literal["kitti", "simulated"]
+    kind: Literal["kitti", "once", "simulated"]
     """Layout of the files; ``simulated`` makes sweeps on the fly and needs no files."""
     path: str = "{data}"
     """Folder; ``{data}`` stands for what ``--data`` gives."""

@@ -11,6 +11,7 @@ from beambox.checks import BeamboxError
 from beambox.data.augment import augment, shuffle_points
 from beambox.data.database import ObjectDatabase
 from beambox.data.kitti import KittiSource
+from beambox.data.once import OnceSource
 from beambox.data.source import FrameSource, SubsetSource
 from beambox.structures import Frame
 from beambox.train.config import AugmentSection, Recipe, SourceSection
@@ -47,6 +48,11 @@ def open_kitti(section: SourceSection, data: Path | None) -> FrameSource:
     return KittiSource(folder_of(section, data), section.split, fov=section.camera_view)
 
 
+def open_once(section: SourceSection, data: Path | None) -> FrameSource:
+    """Open a data set in ONCE's layout; its labels surround the sensor, so ``camera_view`` does nothing."""
+    return OnceSource(folder_of(section, data), section.split)
+
+
 def open_simulated(section: SourceSection, data: Path | None) -> FrameSource:
     """Make sweeps on the fly; slow for training on, handy for trying a recipe without any data."""
     from beambox.simulate import SimulatedSource
@@ -64,6 +70,7 @@ def open_simulated(section: SourceSection, data: Path | None) -> FrameSource:
 
 OPENERS: dict[str, Callable[[SourceSection, Path | None], FrameSource]] = {
     "kitti": open_kitti,
+    "once": open_once,
     "simulated": open_simulated,
 }
 
