@@ -231,6 +231,32 @@ def test_height_chain_of_the_eightfold_backbone(shape, chain):
     assert heights == chain
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=["bfloat16", "float16"])
+def test_half_precision_stays_half_and_close(backend, dtype):
+    x = random_sparse(12, (7, 9, 40), 2, 0.3, 8, torch.float32)
+    weight, bias = parameters((3, 3, 3), 8, 6, torch.float32)
+    direction = torch.randn(len(x.sites), 6, generator=torch.Generator().manual_seed(1))
+
+    def run(kind):
+        leaves = [t.to(kind).requires_grad_() for t in (x.features.clone(), weight.clone(), bias.clone())]
+        out = submanifold_conv3d(x.with_features(leaves[0]), leaves[1], leaves[2]).features
+        return [out, *torch.autograd.grad((out * direction.to(kind)).sum(), leaves)]
+
+    for half, full in zip(run(dtype), run(torch.float32)):
+        assert half.dtype == dtype
+        torch.testing.assert_close(half.float(), full, rtol=0, atol=0.02 * float(full.detach().abs().max()))
+
+
+def test_autocast_gives_what_the_processor_is_good_at():
+    x = random_sparse(13, channels=4, dtype=torch.float32)
+    weight, _ = parameters((3, 3, 3), 4, 4, torch.float32)
+    plain = submanifold_conv3d(x, weight).features
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = submanifold_conv3d(x, weight).features
+    assert cast.dtype in (torch.bfloat16, torch.float32)
+    torch.testing.assert_close(cast.float(), plain, rtol=0, atol=0.05)
+
+
 def many_threads_agree(repetitions: int) -> None:
     """Run one network's worth of layers again and again on 1, 2 and 4 threads and compare every bit."""
     x = random_sparse(11, (11, 40, 40), 2, 0.1, 16, torch.float32)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
 from beambox.ops.sparse_conv import reference
 from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple, linear_keys
 from beambox.ops.sparse_conv.tensor import SparseTensor
@@ -26,6 +27,26 @@ __all__ = [
 ]
 
 
+def _can_run_numba(*tensors: Tensor) -> str | None:
+    """Return why the CPU version cannot run; unlike other operations it takes half precision too."""
+    half = (torch.bfloat16, torch.float16)
+    return can_run_numba(*(t.float() if t.dtype in half and t.device.type == "cpu" else t for t in tensors))
+
+
+def _can_run_triton(*tensors: Tensor) -> str | None:
+    """Return why Triton cannot run; its matrix products have no float64 everywhere."""
+    reason = can_run_triton(*tensors)
+    if reason is None and any(t.dtype == torch.float64 for t in tensors):
+        return "a tensor is float64, the Triton version takes float32, float16 or bfloat16"
+    return reason
+
+
+def _triton() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.gpu import convolve
+
+    return convolve
+
+
 def _numba() -> Callable[..., Tensor]:
     from beambox.ops.sparse_conv.cpu import convolve
 
@@ -38,7 +59,11 @@ def _numba_targets() -> Callable[..., Tensor]:
     return find_targets
 
 
-BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.convolve))
+BACKENDS = (
+    Backend("triton", _can_run_triton, _triton),
+    Backend("numba", _can_run_numba, _numba),
+    Backend("reference", always, lambda: reference.convolve),
+)
 TARGET_BACKENDS = (
     Backend("numba", can_run_numba, _numba_targets),
     Backend("reference", always, lambda: reference.find_targets),
@@ -152,5 +177,18 @@ def _check_weight(x: SparseTensor, weight: Tensor) -> None:
 
 
 def _convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
+    dtype = _working_type(features)
+    features, weight = features.to(dtype), weight.flatten(0, 2).to(dtype)
+    bias = None if bias is None else bias.to(dtype)
     tensors = (features, weight) if bias is None else (features, weight, bias)
-    return choose("sparse_conv", BACKENDS, *tensors)(features, weight.flatten(0, 2), bias, pairs)
+    return choose("sparse_conv", BACKENDS, *tensors)(features, weight, bias, pairs)
+
+
+def _working_type(features: Tensor) -> torch.dtype:
+    """Return autocast's type where it is on, except on processors where it would not pay."""
+    kind = features.device.type
+    if not torch.is_autocast_enabled(kind):
+        return features.dtype
+    if kind == "cpu" and not torch.cpu._is_amx_tile_supported():
+        return torch.promote_types(features.dtype, torch.float32)
+    return torch.get_autocast_dtype(kind)

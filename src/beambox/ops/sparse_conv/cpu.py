@@ -4,19 +4,30 @@ Outputs are worked on in blocks of rows; in a block the kernel's offsets follow 
 are gathered, multiplied and added in one pass (:mod:`beambox.ops.sparse_conv.tiles`). Every output row thus adds its
 neighbours in the order of the offsets. Gradients with respect to the input are the same product along the inverse map;
 those of the weights are summed block after block.
+
+In half precision the rows that a stretch of outputs sees are laid side by side and multiplied by PyTorch, which knows
+the processor's matrix units.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.sparse_conv.autograd import convolve_with
+from beambox.ops.sparse_conv.cpu_maps import BLOCK, BlockPairs
 from beambox.ops.sparse_conv.sites import KernelMap
 from beambox.ops.sparse_conv.tiles import ROWS, VECTOR_BYTES, WIDE, multiply_rows, outer_products
 
 __all__ = ["accumulate", "convolve", "multiply"]
+
+STRETCH = 4
+"""Blocks laid side by side at a time in half precision."""
 
 _rows_1, _rows_2, _rows_4 = (multiply_rows[n] for n in (1, 2, 4))
 _outer_1, _outer_2, _outer_4 = (outer_products[n] for n in (1, 2, 4))
@@ -24,28 +35,9 @@ _outer_1, _outer_2, _outer_4 = (outer_products[n] for n in (1, 2, 4))
 
 def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Gather, multiply and add, as :func:`beambox.ops.sparse_conv.reference.convolve` defines it; differentiable."""
-    return _Convolution.apply(features, weight, bias, pairs)
-
-
-class _Convolution(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, features, weight, bias, pairs):
-        ctx.save_for_backward(features, weight)
-        ctx.pairs = pairs
-        return multiply(features, weight, bias, pairs)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        features, weight = ctx.saved_tensors
-        of_features = of_weight = of_bias = None
-        if ctx.needs_input_grad[0]:
-            of_features = multiply(grad, weight.transpose(1, 2), None, ctx.pairs.inverse)
-        if ctx.needs_input_grad[1]:
-            of_weight = accumulate(features, grad, ctx.pairs)
-        if ctx.needs_input_grad[2]:
-            of_bias = grad.t().contiguous().sum(dim=1)  # one thread a channel
-        return of_features, of_weight, of_bias, None
+    if features.dtype in (torch.bfloat16, torch.float16):
+        return convolve_with(multiply_half, accumulate_half, features, weight, bias, pairs)
+    return convolve_with(multiply, accumulate, features, weight, bias, pairs)
 
 
 def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
@@ -56,9 +48,9 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
     if bias is None:
         out.zero_()
     else:
-        out.copy_(_filled(bias.detach()).expand_as(out))
+        out.copy_(_filled(bias).expand_as(out))
     if len(features):
-        x, w, y = features.detach().contiguous().numpy(), _filled(weight.detach()).contiguous().numpy(), out.numpy()
+        x, w, y = features.contiguous().numpy(), _filled(weight).contiguous().numpy(), out.numpy()
         source, target = blocks.source.reshape(-1), blocks.target.reshape(-1)
         run_in_blocks(
             lambda first, last: _multiply(x, w, source, target, blocks.count, y, first, last), len(blocks.count)
@@ -70,12 +62,55 @@ def accumulate(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
     """Compute the gradient of the weights: ``(K, C_in, C_out)``."""
     c_in, c_out = features.shape[1], grad.shape[1]
     blocks = pairs.blocks
-    x = functional.pad(features.detach(), (0, -c_in % ROWS)).contiguous().numpy()
-    g = _filled(grad.detach()).contiguous().numpy()
+    x = functional.pad(features, (0, -c_in % ROWS)).contiguous().numpy()
+    g = _filled(grad).contiguous().numpy()
     out = features.new_zeros((pairs.geometry.offsets, x.shape[1], g.shape[1]))
     y, source, target = out.numpy(), blocks.source.reshape(-1), blocks.target.reshape(-1)
     run_in_blocks(lambda first, last: _accumulate(x, g, source, target, blocks.count, y, first, last), len(out))
     return out[:, :c_in, :c_out].contiguous()
+
+
+def multiply_half(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
+    """Compute the convolution in half precision; each output row is one sum over K * C_in products."""
+    order = pairs.target.order
+    out = features.new_empty((len(order), weight.shape[2]))
+    kernel = weight.reshape(-1, weight.shape[2])  # (K * C_in, C_out)
+    for start, laid in _side_by_side(features, pairs):
+        product = laid @ kernel if bias is None else torch.addmm(bias, laid, kernel)
+        out[order[start : start + len(laid)]] = product
+    return out
+
+
+def accumulate_half(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
+    """Compute the gradient of the weights in half precision, summed in float32."""
+    order = pairs.target.order
+    total = features.new_zeros((pairs.geometry.offsets * features.shape[1], grad.shape[1]), dtype=torch.float32)
+    for start, laid in _side_by_side(features, pairs):
+        total += laid.t() @ grad[order[start : start + len(laid)]]
+    return total.reshape(-1, features.shape[1], grad.shape[1]).to(features.dtype)
+
+
+def _side_by_side(features: Tensor, pairs: KernelMap) -> Iterator[tuple[int, Tensor]]:
+    """Yield, for stretches of outputs in ascending order, the rows each sees: ``(rows, K * C_in)``, zero for none."""
+    order, blocks = pairs.target.order, pairs.blocks
+    place = torch.empty_like(order)
+    place[order] = torch.arange(len(order))
+    width = blocks.count.shape[1] * features.shape[1]
+    x = features.contiguous().view(torch.int16).numpy()
+    for first in range(0, len(blocks.count), STRETCH):
+        last = min(first + STRETCH, len(blocks.count))
+        start = first * BLOCK
+        laid = torch.zeros((min(len(order), last * BLOCK) - start, width), dtype=features.dtype)
+        y = laid.view(torch.int16).numpy()
+        if len(features):
+            run_in_blocks(_laying(x, blocks, place.numpy(), y, first, start), last - first)
+        yield start, laid
+
+
+def _laying(
+    x: np.ndarray, blocks: BlockPairs, place: np.ndarray, y: np.ndarray, first: int, start: int
+) -> Callable[[int, int], None]:
+    return lambda a, b: _lay(x, blocks.source, blocks.target, blocks.count, place, y, start, first + a, first + b)
 
 
 def _lanes(values: Tensor) -> int:
@@ -139,3 +174,14 @@ def _accumulate(x, grad, source, target, count, out, first_offset, last_offset):
                     else:
                         _outer_1(x, grad, out, source, target, first, pairs, k, channel, v * lanes)
                         v += 1
+
+
+@jit
+def _lay(x, source, target, count, place, laid, start, first_block, last_block):
+    channels = x.shape[1]
+    for block in range(first_block, last_block):
+        for k in range(count.shape[1]):
+            for pair in range(count[block, k]):
+                row, at = source[block, k, pair], place[target[block, k, pair]] - start
+                for c in range(channels):
+                    laid[at, k * channels + c] = x[row, c]
