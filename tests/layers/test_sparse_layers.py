@@ -7,9 +7,11 @@ import torch
 import torch.nn.functional as F
 
 from beambox.checks import BeamboxError
-from beambox.layers.encoders import VoxelEncoder
+from beambox.geometry.grid import VoxelGrid
+from beambox.layers.encoders import VoxelEncoder, mean_voxels
 from beambox.layers.sparse import InverseConv3d, SparseConv3d, sparse_block, submanifold_block
 from beambox.ops.sparse_conv import SparseTensor
+from beambox.ops.voxelize import voxelize
 from oracles.sparse_conv import dense_weight, random_sparse, read_at
 
 
@@ -92,3 +94,16 @@ def test_map_channels_follow_from_the_height(levels, channels):
 def test_a_grid_too_flat_is_refused():
     with pytest.raises(BeamboxError, match="does not fit an input"):
         VoxelEncoder(4).bev_channels(8)
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_mean_voxels_tell_where_the_points_are(absolute):
+    grid = VoxelGrid((0.0, -2.0, -1.0), (4.0, 2.0, 1.0), (0.5, 0.5, 0.5))
+    points = torch.tensor([[3.1, 1.2, 0.1, 0.5], [3.3, 1.4, 0.3, 0.7], [0.6, -1.9, -0.9, 0.0]])
+    voxels = voxelize(points, torch.zeros(3, dtype=torch.int64), 1, grid)
+    described = mean_voxels(voxels, absolute)
+    assert described.indices.tolist() == [[0, 0, 0, 1], [0, 2, 6, 6]]
+    assert described.shape == (5, 8, 8)
+    first = [0.6, -1.9, -0.9, 0.0] if absolute else [-0.3, -0.3, -0.9, 0.0]
+    second = [3.2, 1.3, 0.2, 0.6] if absolute else [-0.1, 0.1, 0.2, 0.6]
+    torch.testing.assert_close(described.features, torch.tensor([first, second]))

@@ -72,6 +72,8 @@ class VoxelRcnnConfig:
     """Voxels kept in a sweep, in order of first appearance; None keeps all (toolbox, at test)."""
     columns: int = 4
     """Values of a point: x, y, z, intensity, ..."""
+    absolute_xy: bool = True
+    """Whether a voxel's mean x and y are told from the sensor; else from the voxel's centre."""
     encoder_widths: tuple[int, int, int, int] = (16, 32, 64, 64)
     """Channels of the sparse encoder's stages (Voxel R-CNN, section 3.3)."""
     encoder_out: int = 128
@@ -185,7 +187,7 @@ class VoxelRcnn(nn.Module):
     def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
         """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
         grid = self.config.grid if grid is None else grid
-        voxels = mean_voxels(self.voxels(batch, grid))  # (V, columns)
+        voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
         stages = self.encoder(voxels)
         bev = self.backbone(stages.bev)  # (B, 256, ny / 8, nx / 8)
         first = self.head(bev, grid)

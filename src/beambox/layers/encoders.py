@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from beambox.layers.sparse import SparseBlock, sparse_block, submanifold_block
@@ -15,12 +16,21 @@ from beambox.ops.voxelize import Voxels
 __all__ = ["EncoderStages", "VoxelEncoder", "mean_voxels"]
 
 
-def mean_voxels(voxels: Voxels) -> SparseTensor:
+def mean_voxels(voxels: Voxels, absolute_xy: bool = True) -> SparseTensor:
     """Describe each voxel by the mean of its kept points, in ascending (b, z, y, x) order.
 
     The height is one level larger than the grid's (SECOND's published code), so that 40 levels shrink to 2.
+
+    Args:
+        voxels: of the points.
+        absolute_xy: whether x and y are metres from the sensor; else they are cells from the voxel's centre, so that a
+            network sees the same wherever it looks.
     """
     means = segment_mean(voxels.points, voxels.voxel, len(voxels.index))  # (V, C)
+    if not absolute_xy:
+        cell = torch.tensor(voxels.grid.cell[:2], device=means.device)
+        offset = (means[:, :2] - voxels.grid.centre(voxels.index[:, 1:])[:, :2]) / cell
+        means = torch.cat((offset.to(means.dtype), means[:, 2:]), dim=1)
     nz, ny, nx = voxels.grid.shape
     return SparseTensor.of(means, voxels.index, (nz + 1, ny, nx), voxels.batch_size).sorted()
 
