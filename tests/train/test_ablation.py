@@ -89,7 +89,7 @@ def test_once_is_scored_by_its_own_rules(tmp_path: Path, opened: list[str]) -> N
 
 def test_the_once_recipe_reads_the_layout_of_once(tmp_path: Path) -> None:
     made = read_recipe(ROOT / "recipes" / "hcnet_once.yaml")
-    with pytest.raises(BeamboxError, match=r"train.txt is not there: no split .* ONCE's layout"):
+    with pytest.raises(BeamboxError, match=r"must hold the folder data/ \(ONCE's layout\)"):
         open_source(made.data[0], tmp_path)
 
 
