@@ -1,0 +1,113 @@
+"""How many voxels lie around each voxel, by counting the bits of columns (numba).
+
+A map seen from above holds one word a column, one bit a cell. In each column that the ball reaches, the cells within
+reach are one ``and`` and one count of bits.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
+
+from beambox.ops.ball_count import reference
+from beambox.ops.ball_count.columns import ball_columns, extent, map_too_large
+from beambox.ops.jit import jit, run_in_blocks
+
+__all__ = ["ball_count"]
+
+
+def ball_count(index: Tensor, cell: tuple[float, float, float], radius: float) -> Tensor:
+    """Count the voxels within a radius; see :func:`beambox.ops.ball_count.ball_count`."""
+    columns = ball_columns(cell, radius)
+    low, span = extent(index)
+    if map_too_large(span, columns):
+        return reference.ball_count(index, cell, radius)
+    pad_y, pad_x = np.abs(columns[:, :2]).max(axis=0)
+    place = index.numpy() - np.array(low) + np.array([0, 0, pad_y, pad_x])
+    shape = (span[1] // 64 + 1, span[2] + 2 * int(pad_y), span[3] + 2 * int(pad_x))  # words in z, y, x
+    steps = columns[:, 0] * shape[2] + columns[:, 1]  # offsets in the flat map
+    heights = columns[:, 2].copy()
+    out = np.empty(len(index), np.int64)
+    for sample in range(span[0]):
+        cells = np.zeros((shape[0], shape[1] * shape[2]), np.uint64)
+        after, tops = _stack(cells, place, sample, shape[2])
+
+        def count(start: int, stop: int, cells: Any = cells, after: Any = after, tops: Any = tops) -> None:
+            _count(cells, place, after, tops[start:stop], shape[2], steps, heights, out)
+
+        run_in_blocks(count, len(tops), smallest=256)
+    return torch.from_numpy(out)
+
+
+@intrinsic
+def _ones(typing_context: Any, word: Any) -> Any:
+    """Count the bits of a word that are set, by the processor's own instruction."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.int64(types.uint64), generate
+
+
+@jit
+def _stack(cells, place, sample, width):
+    """Set the bit of each voxel of a sample (word z // 64 of its column, bit z % 64) and chain those of a column.
+
+    Returns:
+        For each voxel the next one of its column, or -1; and for each column that has any, the first.
+    """
+    top = np.full(cells.shape[1], -1, np.int64)
+    after = np.empty(len(place), np.int64)
+    columns = np.empty(len(place), np.int64)
+    n = 0
+    for row in range(len(place)):
+        if place[row, 0] != sample:
+            continue
+        z, column = place[row, 1], place[row, 2] * width + place[row, 3]
+        cells[z >> 6, column] |= np.uint64(1) << np.uint64(z & 63)
+        if top[column] < 0:
+            columns[n] = column
+            n += 1
+        after[row] = top[column]
+        top[column] = row
+    return after, top[columns[:n]]
+
+
+@jit
+def _count(cells, place, after, tops, width, steps, heights, out):
+    """Write the counts of the voxels of some columns."""
+    tallest = heights.max()
+    within = np.empty(tallest + 1, np.uint64)  # by height: the bits of a word within reach of a voxel
+    around = np.empty(len(steps), np.uint64)  # the words around a column that are not empty, and their heights
+    height_of = np.empty(len(steps), np.int64)
+    everything = np.uint64(0xFFFFFFFFFFFFFFFF)
+    for top in tops:
+        centre = place[top, 2] * width + place[top, 3]
+        row = top
+        while row >= 0:
+            out[row] = 0
+            row = after[row]
+        for word in range(len(cells)):
+            n = 0
+            for k in range(len(steps)):  # without a branch: an empty word is overwritten by the next
+                found = cells[word, centre + steps[k]]
+                around[n], height_of[n] = found, heights[k]
+                n += found != 0
+            row = top
+            while row >= 0 and n > 0:
+                z = place[row, 1] - 64 * word
+                for height in range(tallest + 1):
+                    low, high = max(z - height, 0), min(z + height, 63)
+                    within[height] = 0
+                    if low <= high:
+                        within[height] = (everything << np.uint64(low)) & (everything >> np.uint64(63 - high))
+                total = 0
+                for k in range(n):
+                    total += _ones(around[k] & within[height_of[k]])
+                out[row] += total
+                row = after[row]

@@ -1,0 +1,25 @@
+"""The Triton kernel of ball counts, on a GPU or through Triton's interpreter (see test_triton.py)."""
+
+import pytest
+import torch
+
+from beambox.ops.ball_count import ball_count, reference
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+
+
+@pytest.mark.parametrize(("count", "levels"), [(1, 5), (100, 40), (60, 130)])
+@pytest.mark.parametrize("radius", [0.15, 0.3])
+def test_ball_count_equals_reference(count, levels, radius):
+    generator = torch.Generator().manual_seed(count)
+    sizes = (2, levels, 12, 12)
+    index = torch.stack([torch.randint(0, size, (count,), generator=generator) for size in sizes], dim=1).to(DEVICE)
+    index[:, 1] -= 7
+    got = ball_count(index, (0.1, 0.1, 0.15), radius)
+    assert got.tolist() == reference.ball_count(index, (0.1, 0.1, 0.15), radius).tolist()
+
+
+def test_ball_count_of_full_columns():
+    z = torch.arange(64, device=DEVICE)
+    index = torch.stack((z * 0, z, z * 0, z * 0), dim=1)
+    assert ball_count(index, (1.0, 1.0, 0.01), 0.9).tolist() == [64] * 64
