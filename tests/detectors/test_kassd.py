@@ -233,9 +233,9 @@ def test_the_scores_loss_moves_boxes_only_if_asked() -> None:
 def test_overfits_two_cars_and_finds_them() -> None:
     torch.manual_seed(0)
     frame = car_frame(1, CAR, [9.5, -3.5, -1.0, 3.7, 1.6, 1.5, -2.0])
-    model = kassd(replace(SMALL, encoder_widths=(8, 8, 16, 16), encoder_out=16, width=16, kam_width=16))
+    model = kassd(replace(SMALL, encoder_widths=(4, 8, 8, 8), width=16, kam_width=16))
     batch = Batch.of([frame])
-    losses = overfit(model, batch, 120, 0.005)
+    losses = overfit(model, batch, 70, 0.01)
     assert losses[-1] < 0.1 * losses[0]
     (found,) = model.decode(model(batch))
     assert frame.labels is not None

@@ -152,9 +152,9 @@ def test_far_infinite_and_no_positions() -> None:
 def test_gradients_with_respect_to_maps_and_boxes() -> None:
     layout = KeypointLayout(m=3, n=2, d=2, e=2)
     kam = KeypointScores(1, layout, 8)
-    grid = VoxelGrid((0.0, -2.4, -3.0), (4.8, 2.4, 1.0), (0.05, 0.05, 0.1))
+    grid = VoxelGrid((0.0, -2.4, -3.0), (4.8, 2.4, 1.0), (0.1, 0.1, 0.1))
     generator = torch.Generator().manual_seed(4)
-    maps = torch.randn(1, layout.count, 12, 12, generator=generator, dtype=torch.float64).requires_grad_()
+    maps = torch.randn(1, layout.count, 6, 6, generator=generator, dtype=torch.float64).requires_grad_()
     boxes = torch.tensor([[2.03, 0.21, -1, 1.9, 1.1, 1.5, 0.4], [4.37, 2.1, -1, 2, 1.1, 1.5, -2]], dtype=torch.float64)
     boxes = boxes.requires_grad_()
     classes, anchors = torch.zeros(2, dtype=torch.int64), torch.tensor([[2.11, 0.05], [4.3, 2.2]], dtype=torch.float64)

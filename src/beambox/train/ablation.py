@@ -142,9 +142,10 @@ def score(model: Any, source: FrameSource, recipe: Recipe) -> dict[str, Any]:
     assert recipe.validation is not None
     model = model.to("cuda" if torch.cuda.is_available() else "cpu")
     frames = scored_frames(detect_frames(network(model), source))
-    if recipe.validation.source.kind == "once":
+    section = recipe.validation
+    if section.source.kind == "once":
         return once.evaluate([(frame.labels, frame.detections) for frame in frames]).to_json()
-    return score_frames(frames, model.config.classes, recipe.validation.iou or None).to_json()
+    return score_frames(frames, model.config.classes, section.iou or None, section.level != "all").to_json()
 
 
 def value_at(scores: Any, path: Sequence[str | int]) -> float | None:
