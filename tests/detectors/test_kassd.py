@@ -260,7 +260,7 @@ def test_overfits_a_real_scan() -> None:
     torch.manual_seed(0)
     model = kassd(replace(SMALL, grid=grid, encoder_widths=(8, 16, 32, 32), encoder_out=32, width=32, kam_width=32))
     batch = Batch.of([replace(frame, labels=labels)])
-    losses = overfit(model, batch, 200, 0.003)
+    losses = overfit(model, batch, 80, 0.005)
     assert losses[-1] < 0.1 * losses[0]
     (found,) = model.decode(model(batch))
     check_found(found[found.scores > 0.5].boxes.detach(), labels.boxes)
