@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
 from beambox.checks import BeamboxError, did_you_mean
+from beambox.detectors.dennet import DenNetConfig, dennet
 from beambox.detectors.hcnet import HCNetConfig, hcnet
 from beambox.detectors.kassd import KassdConfig, kassd
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
@@ -28,6 +29,7 @@ class CatalogueEntry:
 
 
 CATALOGUE: dict[str, CatalogueEntry] = {
+    "dennet": CatalogueEntry(DenNetConfig, dennet),
     "hcnet": CatalogueEntry(HCNetConfig, hcnet),
     "kassd": CatalogueEntry(KassdConfig, kassd),
     "pointpillars": CatalogueEntry(PointPillarsConfig, pointpillars),
@@ -60,7 +62,7 @@ def entry_of(name: str) -> CatalogueEntry:
 def name_of(model: nn.Module) -> str:
     """Return the catalogue's name of a model, found by the type of its configuration."""
     for name, entry in CATALOGUE.items():
-        if isinstance(getattr(model, "config", None), entry.config):
+        if type(getattr(model, "config", None)) is entry.config:  # DenNet's extends Voxel R-CNN's
             return name
     raise BeamboxError(f"{type(model).__name__} is not in the catalogue of detectors")
 

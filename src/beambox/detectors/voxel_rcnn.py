@@ -31,7 +31,7 @@ from beambox.detectors.second import KITTI_VOXELS, ONCE_VOXELS, STRIDE
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass, AnchorGrid
 from beambox.layers.bev import BevBackbone
-from beambox.layers.encoders import VoxelEncoder, mean_voxels
+from beambox.layers.encoders import EncoderStages, VoxelEncoder, mean_voxels
 from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss
 from beambox.layers.roi import (
     ProposalLimits,
@@ -50,7 +50,7 @@ from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["KITTI", "ONCE", "VoxelRcnn", "VoxelRcnnConfig", "VoxelRcnnPredictions", "voxel_rcnn"]
+__all__ = ["KITTI", "ONCE", "TwoStage", "VoxelRcnn", "VoxelRcnnConfig", "VoxelRcnnPredictions", "voxel_rcnn"]
 
 FINE_POOLING = tuple(PoolLevel(stride, (4, 4, 4), radius) for stride, radius in ((2, 0.4), (4, 0.8), (8, 1.6)))
 """Voxel RoI pooling for voxels of 0.05 m (toolbox)."""
@@ -158,38 +158,23 @@ class VoxelRcnnPredictions:
     """The second stage's view of the proposals; None in training, where the loss chooses the regions to look at."""
 
 
-class VoxelRcnn(nn.Module):
-    """The network; see :class:`VoxelRcnnConfig`.
-
-    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`VoxelRcnnPredictions`.
-    """
+class TwoStage(nn.Module):
+    """What Voxel R-CNN shares with its successors: all but the 2-D network and what feeds it."""
 
     def __init__(self, config: VoxelRcnnConfig) -> None:
         super().__init__()
         self.config = config
         self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE * config.strides[0], config.centred_anchors)
         self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
-        self.backbone = BevBackbone(
-            self.encoder.bev_channels(config.grid.shape[0]),
-            config.depths,
-            config.strides,
-            config.widths,
-            config.up_strides,
-            config.up_widths,
-        )
-        self.head = AnchorHead(self.backbone.out_channels, self.anchors)
+        self.head = AnchorHead(sum(config.up_widths), self.anchors)
         channels = dict(zip((2, 4, 8), self.encoder.stage_channels))
         self.roi_pool = VoxelRoiPool(
             [channels[level.stride] for level in config.pooling], config.pooling, config.lattice
         )
         self.roi_head = RoiHead(self.roi_pool.out_channels, config.roi_width, config.dropout)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
-        grid = self.config.grid if grid is None else grid
-        voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
-        stages = self.encoder(voxels)
-        bev = self.backbone(stages.bev)  # (B, 256, ny / 8, nx / 8)
+    def detect(self, stages: EncoderStages, bev: Tensor, grid: VoxelGrid) -> VoxelRcnnPredictions:
+        """Predict anchors from the 2-D network's map, and, unless in training, refine the best ones."""
         first = self.head(bev, grid)
         rois = propose(first, self.config.train_proposals if self.training else self.config.test_proposals)
         by_stride = {2: stages.stride2, 4: stages.stride4, 8: stages.stride8}
@@ -235,6 +220,32 @@ class VoxelRcnn(nn.Module):
             refined = self.refine(rois, predictions.levels, predictions.first.grid)
         boxes = decode_rois(refined.codes.float(), rois.boxes)
         return detections_from(select_rois(rois, refined.cls, boxes, self.config.post), self.config.classes)
+
+
+class VoxelRcnn(TwoStage):
+    """The network; see :class:`VoxelRcnnConfig`.
+
+    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`VoxelRcnnPredictions`.
+    """
+
+    def __init__(self, config: VoxelRcnnConfig) -> None:
+        super().__init__(config)
+        self.backbone = BevBackbone(
+            self.encoder.bev_channels(config.grid.shape[0]),
+            config.depths,
+            config.strides,
+            config.widths,
+            config.up_strides,
+            config.up_widths,
+        )
+
+    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+        grid = self.config.grid if grid is None else grid
+        voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
+        stages = self.encoder(voxels)
+        bev = self.backbone(stages.bev)  # (B, 256, ny / 8, nx / 8)
+        return self.detect(stages, bev, grid)
 
 
 def voxel_rcnn(config: VoxelRcnnConfig | None = None) -> VoxelRcnn:
