@@ -15,7 +15,7 @@ from beambox.data.source import FrameSource
 from beambox.detectors.catalogue import CATALOGUE, config_from_dict
 from beambox.metrics.kitti_result import AveragePrecision, ClassResult, KittiResult
 from beambox.train import ablation
-from beambox.train.ablation import Interrupted, merged, report, row_recipe, run_table, to_json, value_at
+from beambox.train.ablation import Interrupted, Timed, merged, report, row_recipe, run_table, to_json, value_at
 from beambox.train.config import Recipe, parse_recipe, read_recipe
 from beambox.train.sources import open_source
 from beambox.train.tables import TABLES, Column, Row, Table, levels, table_of
@@ -83,7 +83,7 @@ def test_once_is_scored_by_its_own_rules(tmp_path: Path, opened: list[str]) -> N
     table = replace(TINY, columns=columns, rows=(Row("plain", (60.0, 50.0), {}),))
     ((run,),) = run_table(table, parse_recipe(plain), None, tmp_path, [0], lambda _: None).values()
     scores = json.loads((tmp_path / "tiny" / "as-recipe" / "seed-0" / "scores.json").read_text())
-    assert set(scores) == {"Vehicle", "Pedestrian", "Cyclist", "mean"}
+    assert set(scores) == {"Vehicle", "Pedestrian", "Cyclist", "mean", "time"}
     assert run == [scores["Vehicle"]["overall"], scores["mean"]["overall"]]
 
 
@@ -195,6 +195,29 @@ def test_columns_find_their_numbers_in_a_kitti_result() -> None:
     assert found == [30, 31, 32, 10, 11, 12, 70, 71, 72]
     assert [value_at(scores, c.path) for c in levels("Car", "3d", "R11")] == [20, 21, 22]
     assert value_at(scores, ("Cyclist", "3d", "R11", 0)) is None
+
+
+def test_columns_find_their_numbers_in_a_once_result() -> None:
+    scores = {
+        **{
+            name: {"overall": ap, "0-30m": 99.0}
+            for name, ap in (("Vehicle", 1.0), ("Pedestrian", 2.0), ("Cyclist", 6.0))
+        },
+        "mean": {"overall": 3.0},
+        "time": {"ms": 40.0},
+    }
+    found = [value_at(scores, column.path) for column in table_of("dennet-table4").columns]
+    assert found == [1.0, 2.0, 6.0, 3.0, 40.0]
+
+
+def test_time_is_told_after_warming_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 9.0, 10.0, 19.0, 20.0, 29.0, 30.0, 30.002, 40.0, 40.004, 50.0, 50.009])
+    monkeypatch.setattr("beambox.train.ablation.time.perf_counter", lambda: next(clock))
+    timed = Timed(lambda frames: [])
+    assert timed.median() is None
+    for _ in range(6):
+        timed([])
+    assert timed.median() == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize("name", TABLES)

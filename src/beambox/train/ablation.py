@@ -7,6 +7,7 @@ import json
 import os
 import re
 import statistics
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -15,14 +16,18 @@ from typing import Any
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
 from beambox.detectors.weights import load_weights, write_atomically
-from beambox.infer.evaluate import detect_frames, network, score_frames, scored_frames
+from beambox.infer.evaluate import Detect, detect_frames, network, score_frames, scored_frames
 from beambox.metrics import once
+from beambox.structures import Detections, Frame
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.loop import FINAL, LAST, train
 from beambox.train.sources import open_source
 from beambox.train.tables import Table
 
 __all__ = ["Interrupted", "Measured", "report", "run_table", "to_json"]
+
+WARM_UP = 3
+"""Sweeps that are detected before time counts."""
 
 Measured = dict[str, list[list[float | None]]]
 """Of each trained row, by name, for every seed the number of each column; None where nothing could be scored."""
@@ -136,16 +141,39 @@ def claim(folder: Path, identity: dict[str, Any]) -> None:
 
 
 def score(model: Any, source: FrameSource, recipe: Recipe) -> dict[str, Any]:
-    """Score a detector by the rules of its data: ONCE's for ONCE, else KITTI's."""
+    """Score a detector by the rules of its data, ONCE's for ONCE, else KITTI's; with the time that it took."""
     import torch
 
     assert recipe.validation is not None
     model = model.to("cuda" if torch.cuda.is_available() else "cpu")
-    frames = scored_frames(detect_frames(network(model), source))
+    timed = Timed(network(model))
+    frames = scored_frames(detect_frames(timed, source))
     section = recipe.validation
     if section.source.kind == "once":
-        return once.evaluate([(frame.labels, frame.detections) for frame in frames]).to_json()
-    return score_frames(frames, model.config.classes, section.iou or None, section.level != "all").to_json()
+        result = once.evaluate([(frame.labels, frame.detections) for frame in frames])
+    else:
+        result = score_frames(frames, model.config.classes, section.iou or None, section.level != "all")
+    return {**result.to_json(), "time": {"ms": timed.median()}}
+
+
+class Timed:
+    """Detects, and keeps the milliseconds of each call; detections arrive on the CPU, so the device is done by then."""
+
+    def __init__(self, detect: Detect) -> None:
+        self.detect = detect
+        self.milliseconds: list[float] = []
+
+    def __call__(self, frames: Sequence[Frame]) -> list[Detections]:
+        """Detect in some frames."""
+        start = time.perf_counter()
+        found = self.detect(frames)
+        self.milliseconds.append(1000 * (time.perf_counter() - start))
+        return found
+
+    def median(self) -> float | None:
+        """Return the median of all calls but the first few, which warm up; None where there is no call left."""
+        steady = self.milliseconds[WARM_UP:]
+        return statistics.median(steady) if steady else None
 
 
 def value_at(scores: Any, path: Sequence[str | int]) -> float | None:

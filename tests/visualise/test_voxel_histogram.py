@@ -1,0 +1,56 @@
+"""The histogram of points a voxel."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from beambox.checks import BeamboxError
+from beambox.data.kitti import KittiSource
+from beambox.structures import Frame
+from beambox.visualise.voxel_histogram import draw_histogram, points_per_voxel, voxel_histogram
+from oracles.paths import data_dir
+
+CELL = (0.1, 0.1, 0.2)
+
+
+def test_points_are_counted_voxel_by_voxel() -> None:
+    points = torch.tensor([[0.05, 0.05, 0.1], [0.01, 0.09, 0.19], [-0.05, 0.05, 0.1], [0.05, 0.05, -0.1]])
+    assert sorted(points_per_voxel(points, CELL).tolist()) == [1, 1, 2]
+    with pytest.raises(BeamboxError, match="`cell` must be three lengths above 0"):
+        points_per_voxel(points, (0.1, 0.0, 0.2))
+
+
+def test_the_last_bar_gathers_the_rest() -> None:
+    one = torch.tensor([[0.05, 0.05, 0.1, 0.0]])
+    frames = [Frame(one), Frame(one.expand(7, 4)), Frame(torch.zeros(0, 4))]
+    histogram = voxel_histogram(frames, CELL, most=3)
+    assert histogram.voxels == (1, 0, 1)
+    assert histogram.shares() == (0.5, 0.0, 0.5)
+    assert histogram.frames == 3
+    assert histogram.table().splitlines() == [
+        "2 occupied voxels of 0.1 x 0.1 x 0.2 m in 3 sweeps",
+        "points   voxels",
+        f"     1   50.00 %  {'#' * 25}",
+        "     2    0.00 %",
+        f"    3+   50.00 %  {'#' * 25}",
+    ]
+
+
+def test_nothing_at_all() -> None:
+    histogram = voxel_histogram([], CELL)
+    assert histogram.shares() == (0.0,) * 10
+    assert draw_histogram(histogram).size == (750, 600)
+
+
+def test_bars_grow_with_their_shares() -> None:
+    one = torch.tensor([[0.05, 0.05, 0.1, 0.0]])
+    several = draw_histogram(voxel_histogram([Frame(one)], CELL, most=2), title="KITTI")
+    none = draw_histogram(voxel_histogram([], CELL, most=2), title="KITTI")
+    assert several.tobytes() != none.tobytes()
+
+
+def test_real_voxels_hold_one_or_two_points() -> None:
+    source = KittiSource(data_dir("kitti"), "full")
+    shares = voxel_histogram([source[0], source[1]], (0.1, 0.1, 0.15)).shares()
+    assert shares[0] > 0.4 and sum(shares[:2]) > 0.6, "the claim of DenNet's figure 2"
