@@ -10,7 +10,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.detectors.pointpillars import KITTI_PILLARS
-from beambox.infer.corrections import Axes
+from beambox.geometry.axes import Axes
 from beambox.infer.doctor import Diagnosis, Trained, examine
 from oracles.paths import data_dir
 from oracles.tiny_detector import street

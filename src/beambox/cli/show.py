@@ -15,7 +15,7 @@ from beambox.cli.console import progress, show_log
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from beambox.infer.corrections import Axes
+    from beambox.geometry.axes import Axes
     from beambox.infer.inputs import Sweep
     from beambox.infer.predictor import Detector
     from beambox.structures import Detections, Frame, Labels
@@ -58,7 +58,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     points and boxes in three dimensions in any browser, and needs no other file.
     """
     from beambox.data.files import write_text
-    from beambox.infer.corrections import Axes
+    from beambox.geometry.axes import Axes
     from beambox.infer.inputs import find_sweeps, read_sweep
     from beambox.infer.predictor import load
     from beambox.visualise.canvas import save_picture

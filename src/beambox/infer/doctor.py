@@ -15,7 +15,8 @@ from torch import Tensor
 from beambox.data.reading import read_frame
 from beambox.data.road import fit_road_plane
 from beambox.geometry import VoxelGrid
-from beambox.infer.corrections import Axes, Corrections
+from beambox.geometry.axes import Axes
+from beambox.infer.corrections import Corrections
 from beambox.structures import Frame
 
 __all__ = ["Diagnosis", "Finding", "Trained", "examine"]

@@ -17,7 +17,8 @@ from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.reading import points_from_array
 from beambox.detectors.weights import load_weights, read_weights
 from beambox.geometry import VoxelGrid
-from beambox.infer.corrections import Axes, Corrections
+from beambox.geometry.axes import Axes
+from beambox.infer.corrections import Corrections
 from beambox.infer.fusion import fold_batch_norms
 from beambox.infer.inputs import Sweep, read_sweep
 from beambox.infer.precision import choose_device, choose_precision

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,6 +15,7 @@ from beambox.geometry import corners_bev
 from beambox.structures import Detections, Frame, Labels
 from beambox.visualise.canvas import SUPER, Canvas
 from beambox.visualise.colours import BACKGROUND, MUTED, PANEL, TEXT, TRUTH, Colour, class_colour, gradient
+from beambox.visualise.tags import Tags
 
 __all__ = ["ColourBy", "Region", "draw_bev", "region_of"]
 
@@ -117,18 +117,18 @@ def draw_bev(
     _draw_rings(canvas, view)
     if looked_at is not None:
         _draw_border(canvas, view, looked_at)
-    tags = _Tags(canvas, width, height, _outline(view, torch.cat(boxes)) if boxes else None)
+    tags = Tags(canvas, width, height, _outline(view, torch.cat(boxes)) if boxes else None)
     if detections is not None:
         _draw_detections(canvas, view, detections)
     if labels is not None:
         _draw_labels(canvas, view, labels, dashed=detections is not None)
     if detections is not None:
-        tags.add_all(
+        tags.beside(
             _outline(view, detections.boxes),
             [(f"{s:.2f}", class_colour(n)) for s, n in zip(detections.scores.tolist(), detections.names)],
         )
     elif labels is not None:
-        tags.add_all(_outline(view, labels.boxes), [(name, TRUTH) for name in labels.names])
+        tags.beside(_outline(view, labels.boxes), [(name, TRUTH) for name in labels.names])
     _draw_scale(canvas, view)
     _draw_legend(canvas, width, height, frame, detections, labels, colour_by, limits, title)
     return canvas.finish()
@@ -206,44 +206,6 @@ def _draw_detections(canvas: Canvas, view: _Map, detections: Detections) -> None
 def score_alpha(score: float) -> int:
     """Return how opaque a detection is drawn: a third at score 0, wholly from 0.7 on."""
     return round(255 * min(1.0, 0.3 + max(score, 0.0)))
-
-
-class _Tags:
-    """Words beside boxes, each where it covers no other; a tag without room is left out."""
-
-    def __init__(self, canvas: Canvas, width: int, height: int, boxes: NDArray[np.floating] | None) -> None:
-        self.canvas, self.width, self.height = canvas, width, height
-        self._taken: list[tuple[float, float, float, float]] = []
-        for corners in () if boxes is None else boxes:  # words do not cover boxes either
-            (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
-            self._taken.append((u0, v0, u1, v1))
-
-    def add_all(self, outlines: NDArray[np.floating], words: Sequence[tuple[str, Colour]]) -> None:
-        """Write beside boxes of ``(N, 4, 2)`` pixels; the first ones get the best places."""
-        for corners, (text, colour) in zip(outlines, words):
-            self._add(corners, text, colour)
-
-    def _add(self, corners: NDArray[np.floating], words: str, colour: Colour, size: float = 11) -> None:
-        half, tall = self.canvas.text_width(words, size) / 2, size * 0.6
-        (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
-        middle_u, middle_v = (u0 + u1) / 2, (v0 + v1) / 2
-        places = (
-            (u1 + half + 4, middle_v),
-            (u0 - half - 4, middle_v),
-            (middle_u, v0 - tall - 2),
-            (middle_u, v1 + tall + 2),
-        )
-        for u, v in places:
-            space = (u - half, v - tall, u + half, v + tall)
-            inside = space[0] > 0 and space[1] > 0 and space[2] < self.width and space[3] < self.height
-            if inside and not any(_overlap(space, other) for other in self._taken):
-                self._taken.append(space)
-                self.canvas.text((u, v), words, colour, size=size, anchor="mm", behind=BACKGROUND)
-                return
-
-
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def _draw_scale(canvas: Canvas, view: _Map) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from beambox.checks import BeamboxError, MissingFileError
@@ -13,6 +15,7 @@ from beambox.geometry import Calibration, corners_3d
 from beambox.structures import Detections, Labels
 from beambox.visualise.canvas import Canvas, Point
 from beambox.visualise.colours import BACKGROUND, TRUTH, Colour, class_colour
+from beambox.visualise.tags import Tags
 
 __all__ = ["box_edges", "draw_camera", "open_image"]
 
@@ -79,16 +82,22 @@ def draw_camera(
     """
     canvas = Canvas(image.width, image.height, BACKGROUND)
     canvas.paste(image, (0, 0))
+    tags = Tags(canvas, image.width, image.height)
     if labels is not None:
-        for box, name in zip(labels.boxes, labels.names):
-            _draw_box(canvas, box, calibration, TRUTH, name if detections is None else "")
+        outlines = [_draw_box(canvas, box, calibration, TRUTH) for box in labels.boxes]
+        if detections is None:
+            _write(tags, outlines, [(name, TRUTH) for name in labels.names])
     if detections is not None:
-        for box, name, score in reversed(list(zip(detections.boxes, detections.names, detections.scores.tolist()))):
-            _draw_box(canvas, box, calibration, class_colour(name), f"{name} {score:.2f}")
+        found = list(zip(detections.boxes, detections.names, detections.scores.tolist()))
+        outlines = [_draw_box(canvas, box, calibration, class_colour(name)) for box, name, _ in reversed(found)]
+        _write(tags, outlines[::-1], [(f"{name} {score:.2f}", class_colour(name)) for _, name, score in found])
     return canvas.finish()
 
 
-def _draw_box(canvas: Canvas, box: torch.Tensor, calibration: Calibration, colour: Colour, words: str) -> None:
+def _draw_box(
+    canvas: Canvas, box: torch.Tensor, calibration: Calibration, colour: Colour
+) -> NDArray[np.floating] | None:
+    """Draw one box; return ``(K, 2)`` ends of its edges, or None where nothing of it is in the picture."""
     edges = box_edges(box, calibration)
     reach = 4 * max(canvas.width, canvas.height)  # an edge that leaves the picture far away is not worth its pixels
     edges = [edge for edge in edges if max(map(abs, (*edge[0], *edge[1]))) < reach]
@@ -99,8 +108,11 @@ def _draw_box(canvas: Canvas, box: torch.Tensor, calibration: Calibration, colou
         canvas.line((start, end), BACKGROUND, 3.0, alpha=110)
     for start, end in edges:
         canvas.line((start, end), colour, 1.5)
-    if edges and words:
-        ends = np.array(edges).reshape(-1, 2)
-        u, v = float(ends[:, 0].mean()), float(ends[:, 1].min()) - 8
-        if 0 <= u < canvas.width and v < canvas.height:
-            canvas.text((u, max(v, 8)), words, colour, size=13, anchor="mm", behind=BACKGROUND)
+    ends = np.array(edges).reshape(-1, 2)
+    inside = (ends >= 0).all(axis=1) & (ends < (canvas.width, canvas.height)).all(axis=1)
+    return ends if inside.any() else None
+
+
+def _write(tags: Tags, outlines: Sequence[NDArray[np.floating] | None], words: Sequence[tuple[str, Colour]]) -> None:
+    shown = [(outline, word) for outline, word in zip(outlines, words) if outline is not None]
+    tags.above([outline for outline, _ in shown], [word for _, word in shown])
