@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from beambox.cli.options import DeviceOption, PrecisionOption, ViewOption
+from beambox.cli.options import DeviceOption, PrecisionOption, RangeOption, ViewOption, parse_range
 
 __all__ = ["command"]
 
 
-def command(
+def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     model: Annotated[str, typer.Argument(help="Shipped name, .safetensors file, or folder of a run.")],
-    data: Annotated[Path, typer.Option(help="Data set in KITTI's layout.")],
+    data: Annotated[Path, typer.Option(help="KITTI or ONCE folder, or the YAML file of one's own data.")],
     split: Annotated[str, typer.Option(help="List of frames: the name of a file in ImageSets.")] = "val",
     classes: Annotated[str, typer.Option(help="Classes to score, as Car,Cyclist; the model's where not given.")] = "",
     iou: Annotated[
@@ -23,34 +23,67 @@ def command(
     score_threshold: Annotated[float, typer.Option(help="Drop detections with lower scores.")] = 0.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the numbers here.")] = None,
     results: Annotated[Path | None, typer.Option(help="Write KITTI result files into this folder.")] = None,
+    range_: RangeOption = "",
     view: ViewOption = "auto",
+    published: Annotated[
+        bool,
+        typer.Option("--published", help="ONCE: print the rows of DenNet's Table 3 as well, apart from ours."),
+    ] = False,
     batch: Annotated[int, typer.Option(min=1, help="Frames in one pass.")] = 1,
     device: DeviceOption = "auto",
     precision: PrecisionOption = "auto",
 ) -> None:
-    """Detect in a labelled data set and score the detections by KITTI's rules."""
+    """Detect in a labelled data set and score by KITTI's rules, or by ONCE's where the data have its layout.
+
+    Data without a camera have no difficulty levels: every object counts, and each class has one AP. Data of one's own
+    are looked at within the range that their YAML file names.
+    """
     import json
 
     from beambox.cli.console import progress
-    from beambox.data.kitti import KittiSource
+    from beambox.data.custom import CustomSource
+    from beambox.data.custom_config import KITTI_GROUND
+    from beambox.data.once import OnceSource
+    from beambox.data.opening import open_data
     from beambox.detectors.weights import write_atomically
-    from beambox.infer.evaluate import detect_frames, parse_overlaps, score_frames, scored_frames, write_results
+    from beambox.infer.evaluate import (
+        detect_frames,
+        parse_overlaps,
+        score_frames,
+        score_once,
+        scored_frames,
+        write_results,
+    )
     from beambox.infer.predictor import load
 
     overlaps = parse_overlaps(iou or [])
-    detector = load(model, device=device, precision=precision, view=view)  # pyright: ignore[reportArgumentType]
-    source = KittiSource(data, split)
+    source = open_data(data, split)
+    region, height = parse_range(range_), None
+    if isinstance(source, CustomSource):
+        region = region or source.config.range
+        height = None if source.config.sensor_height is None else -KITTI_GROUND
+    detector = load(
+        model,
+        device=device,
+        precision=precision,
+        view=view,  # pyright: ignore[reportArgumentType]
+        range=region,
+        sensor_height=height,
+    )
     found = detect_frames(detector.detect, source, batch=batch, score_threshold=score_threshold)
     frames = scored_frames(progress(found, len(source), "detecting"))
     if results is not None:
         write_results(results, frames)
     wanted = classes.split(",") if classes else list(detector.classes)
-    scored = score_frames(frames, wanted)
-    print(scored.table())
-    numbers: dict[str, object] = dict(scored.to_json())
-    if overlaps:
-        again = score_frames(frames, wanted, overlaps)
-        print(again.table())
-        numbers = {"default": numbers, "given": again.to_json()}
+    tables = []
+    for thresholds in [None, overlaps] if overlaps else [None]:
+        if isinstance(source, OnceSource):
+            scored = score_once(frames, thresholds)
+            print(scored.table(Path(model).stem, published))
+        else:
+            scored = score_frames(frames, wanted, thresholds)
+            print(scored.table())
+        tables.append(scored.to_json())
+    numbers = {"default": tables[0], "given": tables[1]} if overlaps else tables[0]
     if json_file is not None:
         write_atomically(json_file, (json.dumps(numbers, indent=2) + "\n").encode())

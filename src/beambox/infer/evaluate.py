@@ -11,11 +11,21 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
+from beambox.metrics import once
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
+from beambox.metrics.once_result import OnceResult
 from beambox.structures import Batch, Detections, Frame
 
-__all__ = ["detect_frames", "network", "parse_overlaps", "score_frames", "scored_frames", "write_results"]
+__all__ = [
+    "detect_frames",
+    "network",
+    "parse_overlaps",
+    "score_frames",
+    "score_once",
+    "scored_frames",
+    "write_results",
+]
 
 Detect = Callable[[Sequence[Frame]], list[Detections]]
 """Frames to their detections, best first, on the CPU; ``Detector.detect`` is one, :func:`network` makes one."""
@@ -107,6 +117,11 @@ def score_frames(
         for frame in frames
     )
     return evaluate(frames, classes, min_overlap=iou, no_difficulty=not graded)
+
+
+def score_once(frames: Sequence[KittiFrame], iou: Mapping[str, float] | None = None) -> OnceResult:
+    """Score frames by ONCE's rules; arguments as in :func:`score_frames`."""
+    return once.evaluate([(frame.labels, frame.detections) for frame in frames], min_overlap=iou)
 
 
 def write_results(folder: Path, frames: Sequence[KittiFrame]) -> None:

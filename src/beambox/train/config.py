@@ -54,10 +54,10 @@ class DetectorSection(Section):
 class SourceSection(Section):
     """One set of frames."""
 
-    kind: Literal["kitti", "once", "simulated"]
-    """Layout of the files; ``simulated`` makes sweeps on the fly and needs no files."""
+    kind: Literal["kitti", "once", "custom", "simulated"]
+    """Layout of the files; ``custom`` is described by a YAML file; ``simulated`` makes sweeps and needs no files."""
     path: str = "{data}"
-    """Folder; ``{data}`` stands for what ``--data`` gives."""
+    """Folder, or the YAML file of a custom one; ``{data}`` stands for what ``--data`` gives."""
     split: str = "train"
     """Name of the list of frames (of sequences, for ONCE)."""
     camera_view: bool = True

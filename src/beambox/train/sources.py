@@ -9,6 +9,7 @@ import numpy as np
 
 from beambox.checks import BeamboxError
 from beambox.data.augment import augment, shuffle_points
+from beambox.data.custom import CustomSource
 from beambox.data.database import ObjectDatabase
 from beambox.data.kitti import KittiSource
 from beambox.data.once import OnceSource
@@ -53,6 +54,11 @@ def open_once(section: SourceSection, data: Path | None) -> FrameSource:
     return OnceSource(folder_of(section, data), section.split)
 
 
+def open_custom(section: SourceSection, data: Path | None) -> FrameSource:
+    """Open a data set described by a YAML file; its frames have no camera either."""
+    return CustomSource(folder_of(section, data), section.split)
+
+
 def open_simulated(section: SourceSection, data: Path | None) -> FrameSource:
     """Make sweeps on the fly; slow for training on, handy for trying a recipe without any data."""
     from beambox.simulate import SimulatedSource
@@ -71,6 +77,7 @@ def open_simulated(section: SourceSection, data: Path | None) -> FrameSource:
 OPENERS: dict[str, Callable[[SourceSection, Path | None], FrameSource]] = {
     "kitti": open_kitti,
     "once": open_once,
+    "custom": open_custom,
     "simulated": open_simulated,
 }
 
