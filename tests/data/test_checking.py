@@ -73,7 +73,7 @@ def test_check_accuses(tmp_path: Path, change: Callable, wanted: list[str]) -> N
 
 def test_check_measures_the_ground(tmp_path: Path) -> None:
     told = found(write_pandaset(tmp_path, 2, "sensor_height: 0.5\n"))
-    assert told == ["the ground lies 1.50 m below where sensor_height puts it"]
+    assert told == ["the ground lies 1.50 m below where sensor_height puts it; raise sensor_height by 1.50"]
 
 
 def test_check_lists_frames(tmp_path: Path) -> None:

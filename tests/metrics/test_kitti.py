@@ -238,6 +238,7 @@ def test_nothing_found_is_zero_and_no_objects_is_unknown() -> None:
     result = simple([Labels.empty()], [found(cars(2), [0.5, 0.4])])
     assert math.isnan(result["Car"].box3d[0].r40)
     assert result.to_json()["Car"]["3d"]["all"] == [None]
+    assert "the labels have no Car" in result.table() and "capped" not in result.table()
 
 
 def test_errors_say_what_to_do(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ __all__ = ["class_rows", "report_json", "report_text", "warnings"]
 
 MANY = 0.5
 """Share of a class's boxes from which a fault is taken to be one of the data set, not of single boxes."""
+UNEVEN = 0.2
+"""The ground may lie this far from where the sensor's height puts it, metres; more costs 3-D overlap."""
 FEW_BOXES = 5
 """Fewer telling boxes than this do not accuse a class."""
 
@@ -62,12 +64,16 @@ def warnings(report: DataReport, ground: float | None = None) -> list[str]:
             out.append("intensity is 0 everywhere; train without it, or look whether another column holds it")
     for row in class_rows(report):
         out += _class_warnings(report, row)
-    if ground is not None and report.ground and abs(np.median(report.ground) - ground) > FLOATING:
+    if ground is not None and report.ground:
         wrong = float(np.median(report.ground)) - ground
-        out.append(
-            f"the ground lies {abs(wrong):.2f} m {'above' if wrong > 0 else 'below'} where sensor_height puts it"
-        )
+        if abs(wrong) > UNEVEN:
+            side = "above" if wrong > 0 else "below"
+            out.append(f"the ground lies {abs(wrong):.2f} m {side} where sensor_height puts it; {_advice(wrong)}")
     return out
+
+
+def _advice(wrong: float) -> str:
+    return f"{'lower' if wrong > 0 else 'raise'} sensor_height by {abs(wrong):.2f}"
 
 
 def _frames_that(what: str, names: Sequence[str], frames: int) -> list[str]:

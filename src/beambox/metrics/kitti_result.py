@@ -103,7 +103,9 @@ class KittiResult:
             for name, averages in result.metrics():
                 blocks = ([a.r40 for a in averages], [a.r11 for a in averages], [a.all_points for a in averages])
                 lines.append(f"{name:<5}" + "".join(_cells(block).rjust(columns + 2) for block in blocks))
-            if min(result.objects) < 41:
+            if not max(result.objects):
+                lines.append(f"     the labels have no {result.name}")
+            elif min(result.objects) < 41:
                 lines.append(f"     fewer than 41 objects: R40 and R11 of {result.name} are capped, read `all`")
         return "\n".join(lines) + "\n"
 
