@@ -136,7 +136,7 @@ class SparseBlock(nn.Module):
             assert mean is not None and variance is not None
             scale = self.norm.weight / torch.sqrt(variance + self.norm.eps)
             out = self.conv(x, scale, self.norm.bias - mean * scale)
-            return out.with_features(functional.relu(out.features))
+            return out.with_features(functional.relu(out.features, inplace=True))
         out = self.conv(x)
         if len(out.features) < 2:  # batch statistics need two values
             features = functional.batch_norm(
@@ -149,7 +149,7 @@ class SparseBlock(nn.Module):
             )
         else:
             features = self.norm(out.features)
-        return out.with_features(functional.relu(features))
+        return out.with_features(functional.relu(features, inplace=True))
 
 
 def submanifold_block(in_channels: int, channels: int, kernel: int | Triple = 3) -> SparseBlock:

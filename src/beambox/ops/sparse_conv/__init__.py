@@ -78,7 +78,7 @@ def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
     if geometry.submanifold:
         target = sites
     else:
-        keys = choose("find_targets", TARGET_BACKENDS, sites.indices)(sites, geometry)
+        keys = choose("find_targets", TARGET_BACKENDS, sites.sorted_keys)(sites, geometry)
         target = Sites.from_keys(keys, geometry.output_shape(sites.shape), sites.batch_size)
     found = KernelMap(sites, target, geometry)
     sites.maps[geometry] = found

@@ -129,21 +129,28 @@ class Sites:
     The kernel maps of convolutions from these sites are kept here, so that layers on the same sites share them.
     """
 
-    indices: Tensor
-    """``(V, 4)`` int64 (b, z, y, x), no row twice, any order."""
+    sorted_keys: Tensor
+    """``(V,)`` int64 linear positions ``((b Z + z) Y + y) X + x``, ascending, none twice."""
+    order: Tensor
+    """``(V,)`` int64 row of each sorted key."""
     shape: Triple
     """Spatial extent (z, y, x) in cells."""
     batch_size: int
     """Number of samples; some may be empty."""
-    sorted_keys: Tensor
-    """``(V,)`` int64 linear positions ``((b Z + z) Y + y) X + x``, ascending."""
-    order: Tensor
-    """``(V,)`` int64 row in ``indices`` of each sorted key."""
     maps: dict[Geometry, KernelMap] = field(default_factory=dict, repr=False)
     """Kernel maps found so far."""
 
+    @cached_property
+    def indices(self) -> Tensor:
+        """``(V, 4)`` int64 (b, z, y, x) of each row."""
+        _, ny, nx = self.shape
+        rest, x = self.sorted_keys // nx, self.sorted_keys % nx
+        rest, y = rest // ny, rest % ny
+        ascending = torch.stack((rest // self.shape[0], rest % self.shape[0], y, x), dim=1)
+        return torch.empty_like(ascending).index_copy_(0, self.order, ascending)
+
     def __len__(self) -> int:
-        return len(self.indices)
+        return len(self.sorted_keys)
 
     @classmethod
     def of(cls, indices: Tensor, shape: Triple, batch_size: int) -> Sites:
@@ -175,16 +182,12 @@ class Sites:
                 f"`indices` must name each site once, got {len(twice)} repeated, first (b, z, y, x) = {row}; "
                 "merge the points of a cell before (voxelize does)"
             )
-        return cls(indices, shape, batch_size, sorted_keys, order)
+        return cls(sorted_keys, order, shape, batch_size)
 
     @classmethod
     def from_keys(cls, keys: Tensor, shape: Triple, batch_size: int) -> Sites:
         """Return sites from ascending linear positions without repeats; trusted."""
-        _, ny, nx = shape
-        rest, x = keys // nx, keys % nx
-        rest, y = rest // ny, rest % ny
-        indices = torch.stack((rest // shape[0], rest % shape[0], y, x), dim=1)  # (V, 4)
-        return cls(indices, shape, batch_size, keys, torch.arange(len(keys), device=keys.device))
+        return cls(keys, torch.arange(len(keys), device=keys.device), shape, batch_size)
 
 
 def linear_keys(indices: Tensor, shape: Triple) -> Tensor:

@@ -77,7 +77,7 @@ class SparseTensor:
         """Return ``(B, C, Z, Y, X)`` with zeros at the sites that are not active."""
         z, y, x = self.shape
         dense = self.features.new_zeros((self.batch_size, z, y, x, self.channels))
-        dense = dense.index_put(tuple(self.indices.unbind(dim=1)), self.features)
+        dense.index_put_(tuple(self.indices.unbind(dim=1)), self.features)
         return dense.permute(0, 4, 1, 2, 3)  # (B, C, Z, Y, X)
 
     def to_bev(self) -> Tensor:
@@ -85,5 +85,5 @@ class SparseTensor:
         z, y, x = self.shape
         b, level, row, column = self.indices.unbind(dim=1)
         bev = self.features.new_zeros((self.batch_size, y, x, self.channels, z))
-        bev = bev.transpose(3, 4).index_put((b, row, column, level), self.features)  # (B, Y, X, Z, C)
-        return bev.transpose(3, 4).flatten(3).permute(0, 3, 1, 2)  # (B, C * Z, Y, X), channels last in memory
+        bev.transpose(3, 4).index_put_((b, row, column, level), self.features)  # (B, Y, X, Z, C) written through
+        return bev.flatten(3).permute(0, 3, 1, 2)  # (B, C * Z, Y, X), channels last in memory
