@@ -130,48 +130,68 @@ def _find_pairs(keys, order, out_keys, out_order, extents, tables, sources, targ
     """Fill the pairs of the blocks from ``first`` to ``last``."""
     shape, out_shape = extents[0], extents[1]
     z_table, y_table, x_table = tables
-    size, nz, ny, nx = len(keys), z_table.shape[1], y_table.shape[1], x_table.shape[1]
-    pointer = np.empty(nz * ny, np.int64)
+    size, ny, nx = len(keys), y_table.shape[1], x_table.shape[1]
+    low, high = _spans(x_table)
+    start = np.empty(z_table.shape[1] * ny, np.int64)  # where each neighbouring row of cells begins, or -1
+    pointer = np.empty(len(start), np.int64)
     for block in range(first, last):
-        start, stop = block * BLOCK, min(len(out_keys), (block + 1) * BLOCK)
         pointer[:] = -1
-        for i in range(start, stop):
-            x = out_keys[i] % out_shape[2]
-            rest = out_keys[i] // out_shape[2]
-            y = rest % out_shape[1]
-            rest //= out_shape[1]
-            z = rest % out_shape[0]
-            b = rest // out_shape[0]
-            for kz in range(nz):
-                if z_table[z, kz] < 0:
+        begin, end = 0, -1  # of the row of cells that the current output lies in
+        for i in range(block * BLOCK, min(len(out_keys), (block + 1) * BLOCK)):
+            if out_keys[i] >= end:
+                line = out_keys[i] // out_shape[2]
+                begin, end = line * out_shape[2], (line + 1) * out_shape[2]
+                y, plane = line % out_shape[1], line // out_shape[1]
+                z, b = plane % out_shape[0], plane // out_shape[0]
+                for row in range(len(start)):
+                    cz, cy = z_table[z, row // ny], y_table[y, row % ny]
+                    start[row] = ((b * shape[0] + cz) * shape[1] + cy) * shape[2] if cz >= 0 and cy >= 0 else -1
+            x = out_keys[i] - begin
+            if high[x] < 0:
+                continue
+            for row in range(len(start)):
+                if start[row] < 0:
                     continue
-                for ky in range(ny):
-                    if y_table[y, ky] < 0:
+                at, wanted = pointer[row], start[row] + low[x]
+                if at < 0:
+                    at = np.searchsorted(keys, wanted)
+                while at < size and keys[at] < wanted:
+                    at += 1
+                while at > 0 and keys[at - 1] >= wanted:
+                    at -= 1
+                pointer[row] = at
+                if at == size or keys[at] > start[row] + high[x]:
+                    continue
+                for kx in range(nx):
+                    if x_table[x, kx] < 0:
                         continue
-                    of_line = kz * ny + ky
-                    line = ((b * shape[0] + z_table[z, kz]) * shape[1] + y_table[y, ky]) * shape[2]
-                    at = pointer[of_line]
-                    if at < 0:
-                        at = np.searchsorted(keys, line)
-                    for kx in range(nx):
-                        if x_table[x, kx] < 0:
-                            continue
-                        wanted = line + x_table[x, kx]
-                        while at < size and keys[at] < wanted:
-                            at += 1
-                        while at > 0 and keys[at - 1] >= wanted:
-                            at -= 1
-                        if at < size and keys[at] == wanted:
-                            k = of_line * nx + kx
-                            place = count[block, k]
-                            sources[block, k, place] = order[at]
-                            targets[block, k, place] = out_order[i]
-                            count[block, k] = place + 1
-                    pointer[of_line] = at
-        for k in range(nz * ny * nx):
+                    wanted = start[row] + x_table[x, kx]
+                    while at < size and keys[at] < wanted:
+                        at += 1
+                    while at > 0 and keys[at - 1] >= wanted:
+                        at -= 1
+                    if at < size and keys[at] == wanted:
+                        k = row * nx + kx
+                        place = count[block, k]
+                        sources[block, k, place] = order[at]
+                        targets[block, k, place] = out_order[i]
+                        count[block, k] = place + 1
+        for k in range(count.shape[1]):
             for place in range(count[block, k], -(-count[block, k] // ROWS) * ROWS):
                 sources[block, k, place] = 0
                 targets[block, k, place] = len(out_keys) + block
+
+
+@jit
+def _spans(table):
+    """Return the least and the greatest coordinate that each row of a table leads to; -1 as the greatest for none."""
+    low, high = np.zeros(len(table), np.int64), np.full(len(table), -1, np.int64)
+    for i in range(len(table)):
+        for place in table[i]:
+            if place >= 0:
+                low[i] = place if high[i] < 0 else min(low[i], place)
+                high[i] = max(high[i], place)
+    return low, high
 
 
 def table_of(pairs: BlockPairs, rows: int) -> Tensor:
