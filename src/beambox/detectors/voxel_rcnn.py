@@ -167,7 +167,7 @@ class TwoStage(nn.Module):
         self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE * config.strides[0], config.centred_anchors)
         self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
         self.head = AnchorHead(sum(config.up_widths), self.anchors)
-        channels = dict(zip((2, 4, 8), self.encoder.stage_channels))
+        channels: dict[int, int] = dict(zip((2, 4, 8), self.encoder.stage_channels))
         self.roi_pool = VoxelRoiPool(
             [channels[level.stride] for level in config.pooling], config.pooling, config.lattice
         )

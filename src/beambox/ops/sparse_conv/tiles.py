@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import llvmlite.binding
 from llvmlite import ir
@@ -37,13 +37,14 @@ def _host() -> tuple[int, int]:
 VECTOR_BYTES, WIDE = _host()
 
 INDEX = ir.IntType(64)
-Value = ir.Value
+Value: TypeAlias = Any
+"""llvmlite is not typed."""
 
 
 class _Emitter:
     """Emits loads, stores and multiply-adds of vectors of one element type."""
 
-    def __init__(self, builder: ir.IRBuilder, element: types.Float) -> None:
+    def __init__(self, builder: Any, element: types.Float) -> None:
         self.builder = builder
         self.bytes = element.bitwidth // 8
         self.scalar = ir.FloatType() if element.bitwidth == 32 else ir.DoubleType()
@@ -78,26 +79,26 @@ class _Emitter:
         return self.builder.call(self._multiply_add, [a, b, total])
 
 
-def _row_of(context: Any, builder: ir.IRBuilder, kind: types.Array, rows: Value, place: Value) -> Value:
+def _row_of(context: Any, builder: Any, kind: types.Array, rows: Value, place: Value) -> Value:
     """Load ``rows[place]`` of an int32 array as a 64-bit integer."""
     base = context.make_array(kind)(context, builder, rows).data
     return builder.sext(builder.load(builder.gep(base, [place])), INDEX)
 
 
-def _data(context: Any, builder: ir.IRBuilder, kind: types.Array, array: Value) -> tuple[Value, list[Value]]:
+def _data(context: Any, builder: Any, kind: types.Array, array: Value) -> tuple[Value, list[Value]]:
     """Return the address of a C-ordered array's first element and its extents."""
     view = context.make_array(kind)(context, builder, array)
     extents = cgutils.unpack_tuple(builder, view.shape, kind.ndim)
     return builder.ptrtoint(view.data, INDEX), extents
 
 
-def _make_multiply_rows(across: int) -> Callable[..., None]:
+def _make_multiply_rows(across: int) -> Callable[..., Any]:
     @intrinsic
     def multiply_rows(typing: Any, x, weight, out, source, target, first, k, column):
         """``out[target[p], columns] += x[source[p]] @ weight[k][:, columns]`` for the four pairs p from ``first``."""
         signature = types.void(x, weight, out, source, target, types.int64, types.int64, types.int64)
 
-        def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> Value:
+        def emit(context: Any, builder: Any, sig: Any, args: Any) -> Value:
             kinds = sig.args
             emitter = _Emitter(builder, kinds[0].dtype)
             x_base, (_, c_in) = _data(context, builder, kinds[0], args[0])
@@ -134,7 +135,7 @@ def _make_multiply_rows(across: int) -> Callable[..., None]:
     return multiply_rows
 
 
-def _make_outer_products(across: int) -> Callable[..., None]:
+def _make_outer_products(across: int) -> Callable[..., Any]:
     @intrinsic
     def outer_products(typing: Any, x, grad, out, source, target, first, count, k, channel, column):
         """``out[k][channels, columns] += sum over count pairs of outer(x[source][channels], grad[target][columns])``.
@@ -144,7 +145,7 @@ def _make_outer_products(across: int) -> Callable[..., None]:
         integers = [types.int64] * 5
         signature = types.void(x, grad, out, source, target, *integers)
 
-        def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> Value:
+        def emit(context: Any, builder: Any, sig: Any, args: Any) -> Value:
             kinds = sig.args
             emitter = _Emitter(builder, kinds[0].dtype)
             x_base, (_, c_in) = _data(context, builder, kinds[0], args[0])
