@@ -90,7 +90,7 @@ def test_importing_operations_imports_neither_numba_nor_triton():
     code = (
         "import sys; import torch; before = set(sys.modules)\n"
         "import beambox.ops.voxelize, beambox.ops.scatter, beambox.ops.rotated_iou, beambox.ops.nms\n"
-        "import beambox.ops.points_in_boxes\n"
+        "import beambox.ops.points_in_boxes, beambox.ops.ball_count, beambox.ops.neighborhood\n"
         "new = {name.split('.')[0] for name in set(sys.modules) - before}\n"
         "print(sorted(new & {'numba', 'triton', 'llvmlite'}))"
     )

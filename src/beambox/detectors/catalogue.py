@@ -38,7 +38,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
 }
 
 
-def build(name: str, options: Mapping[str, Any] | None = None) -> nn.Module:
+def build(name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Build a detector by name.
 
     Args:

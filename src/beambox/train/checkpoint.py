@@ -113,7 +113,7 @@ def restore_module(module: nn.Module, tensors: Mapping[str, Tensor], where: str)
 def optimizer_state(optimizer: torch.optim.Optimizer, names: Mapping[nn.Parameter, str]) -> dict[str, Tensor]:
     """Return the optimiser's state as ``optim.<parameter>.<moment>`` tensors."""
     return {
-        f"optim.{names[parameter]}.{moment}": value
+        f"optim.{names[parameter]}.{moment}": value  # pyright: ignore[reportArgumentType]
         for parameter, moments in optimizer.state.items()
         for moment, value in moments.items()
     }

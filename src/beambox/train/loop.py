@@ -62,9 +62,9 @@ class Outcome:
 class TrainStep(nn.Module):
     """Network and loss as one module, so that one forward pass of it is all that mixed precision and DDP see."""
 
-    def __init__(self, detector: nn.Module) -> None:
+    def __init__(self, detector: Any) -> None:
         super().__init__()
-        self.detector = detector
+        self.detector: Any = detector
 
     def forward(self, work: TrainingBatch) -> dict[str, Tensor]:
         """Return the named losses of a batch."""
@@ -76,7 +76,7 @@ class TrainStep(nn.Module):
 class Run:
     """A detector in training: everything that changes from step to step, and how to save and restore it."""
 
-    def __init__(self, recipe: Recipe, detector: nn.Module, feed: Feed, fabric: Fabric, folder: Path) -> None:
+    def __init__(self, recipe: Recipe, detector: Any, feed: Feed, fabric: Fabric, folder: Path) -> None:
         self.recipe, self.detector, self.feed, self.fabric, self.folder = recipe, detector, feed, fabric, folder
         optim = recipe.optim
         per_epoch = len(feed.source) / optim.batch

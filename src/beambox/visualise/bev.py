@@ -124,11 +124,11 @@ def draw_bev(
         _draw_labels(canvas, view, labels, dashed=detections is not None)
     if detections is not None:
         tags.beside(
-            _outline(view, detections.boxes),
+            list(_outline(view, detections.boxes)),
             [(f"{s:.2f}", class_colour(n)) for s, n in zip(detections.scores.tolist(), detections.names)],
         )
     elif labels is not None:
-        tags.beside(_outline(view, labels.boxes), [(name, TRUTH) for name in labels.names])
+        tags.beside(list(_outline(view, labels.boxes)), [(name, TRUTH) for name in labels.names])
     _draw_scale(canvas, view)
     _draw_legend(canvas, width, height, frame, detections, labels, colour_by, limits, title)
     return canvas.finish()

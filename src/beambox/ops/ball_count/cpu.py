@@ -44,14 +44,16 @@ def ball_count(index: Tensor, cell: tuple[float, float, float], radius: float) -
     return torch.from_numpy(out)
 
 
-@intrinsic
-def _ones(typing_context: Any, word: Any) -> Any:
+def _count_ones(typing_context: Any, word: Any) -> Any:
     """Count the bits of a word that are set, by the processor's own instruction."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
 
     return types.int64(types.uint64), generate
+
+
+_ones: Any = intrinsic(_count_ones)
 
 
 @jit

@@ -1,5 +1,8 @@
 """How many voxels lie around each voxel, by counting the bits of columns, on a GPU (Triton); see ``cpu.py``."""
 
+# Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 import numpy as np

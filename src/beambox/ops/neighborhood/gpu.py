@@ -5,6 +5,9 @@ of its denominator is kept. Backward, the weights are computed again; the gradie
 queries that saw a pixel.
 """
 
+# Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from typing import Any

@@ -1,5 +1,8 @@
 """Non-maximum suppression on a GPU: Triton finds who overlaps whom, one bit a pair; the CPU walks the bits (numba)."""
 
+# Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 import numpy as np

@@ -7,6 +7,9 @@ y, held within [-W, W]. Edges walked towards -x (the upper border, counter-clock
 negative. No case distinctions, no ill-conditioned crossings; the same number as clipping gives.
 """
 
+# Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 import torch

@@ -1,5 +1,8 @@
 """Reductions over groups of rows on a GPU (Triton): one program a segment, no atomics, the same sum every time."""
 
+# Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from typing import Any

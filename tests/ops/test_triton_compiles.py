@@ -1,0 +1,78 @@
+"""Compile every Triton kernel to a GPU's machine code: this needs no GPU, and shows what the interpreter lets pass."""
+
+import os
+from importlib.util import find_spec
+
+import pytest
+
+pytestmark = [
+    pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed; it is for Linux on x86-64"),
+    pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="interpreted kernels cannot be compiled"),
+]
+
+AMPERE = 80
+
+
+def compile_kernel(kernel, **arguments):
+    """Compile for given arguments: a text is the type of a run-time argument, anything else a constant."""
+    import triton
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    assert list(arguments) == kernel.arg_names, "give every argument, in order"
+    types = {name: value if isinstance(value, str) else "constexpr" for name, value in arguments.items()}
+    constants = {name: value for name, value in arguments.items() if not isinstance(value, str)}
+    compiled = triton.compile(ASTSource(kernel, types, constants), target=GPUTarget("cuda", AMPERE, 32))
+    assert compiled.asm["cubin"]
+
+
+def test_overlaps_compile():
+    from beambox.ops.rotated_iou import gpu
+
+    compile_kernel(gpu._fill, a="*fp64", b="*fp64", out="*fp64", n="i32", m="i32", what=gpu.IOU_3D, tile=gpu.TILE)
+
+
+def test_nms_compiles():
+    from beambox.ops.nms import gpu
+
+    compile_kernel(gpu._mark, boxes="*fp64", overlaps="*i64", count="i32", words="i32", limit="*fp64", rows=gpu.ROWS)
+
+
+@pytest.mark.parametrize(("values", "largest"), [("*fp32", True), ("*fp64", True), ("*bf16", False)])
+def test_segments_compile(values, largest):
+    import triton.language as tl
+
+    from beambox.ops.scatter import gpu
+
+    wide = tl.float64 if values == "*fp64" else tl.float32
+    compile_kernel(
+        gpu._reduce_segment, values=values, order="*i64", start="*i64", out=values, winner="*i64", rows="i32",
+        columns="i32", largest=largest, wide=wide, block=64,
+    )  # fmt: skip
+
+
+def test_ball_count_compiles():
+    from beambox.ops.ball_count import gpu
+
+    compile_kernel(
+        gpu._count, cells="*i64", column="*i64", z="*i64", steps="*i64", heights="*i64", out="*i64", voxels="i32",
+        reach="i32", words=1, map_size="i32", block=gpu.BLOCK,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("kept", "given", "ones"), [("*fp32", "*fp32", False), ("*fp32", "*bf16", True)])
+def test_attention_compiles(kept, given, ones):
+    from beambox.ops.neighborhood import gpu
+
+    size = 1 if ones else "i32"  # Triton makes a constant of every size that is 1
+    sizes = {"heads": size, "height": "i32", "width": "i32", "depth": size, "window": 7, "block": gpu.BLOCK}
+    sizes["deep"] = 1 if ones else 32
+    compile_kernel(gpu._attend, q=given, k=given, v=given, bias=given, out=given, log_total=kept, **sizes)
+    compile_kernel(
+        gpu._to_queries, q=given, k=given, v=given, bias=given, log_total=kept, mean=kept, gradient=given, weights=kept,
+        slopes=kept, dq=given, **sizes,
+    )  # fmt: skip
+    compile_kernel(
+        gpu._to_keys, q=given, weights=kept, slopes=kept, gradient=given, dk=given, dv=given, row_low="*i64",
+        row_high="*i64", **sizes,
+    )  # fmt: skip
