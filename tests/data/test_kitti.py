@@ -113,7 +113,7 @@ def test_labels_without_attributes_are_written_with_what_follows_from_the_box() 
         (CAR + "Car 0 0 1\n", "label_2/000012.txt, line 2: expected 15 or 16 columns, got 4"),
         (CAR.replace("58.49", "x"), 'label_2/000012.txt, line 1: expected numbers, got "x"'),
         (CAR.replace("58.49", "nan"), 'label_2/000012.txt, line 1: expected finite numbers, got "nan"'),
-        (CAR.replace("1.87", "1e9"), "line 1: expected metres, pixels and radians, got 1e+09"),
+        (CAR.replace("1.87", "1e10"), "line 1: expected metres, pixels and radians, got 1e+10"),
         (
             CAR.replace("1.87", "-1"),
             "line 1: height, width and length (columns 9 to 11) must be at least 0, got 1.67 -1 ",

@@ -221,7 +221,8 @@ def test_unknown_heading_leaves_orientation_out(tmp_path: Path) -> None:
 
 
 def test_json_and_table_name_the_protocol(tmp_path: Path) -> None:
-    result = evaluate_files(*write(tmp_path, [scene(np.random.default_rng(1))]))
+    label = "Car 0 0 0.5 100 100 200 180 1.5 1.6 4 0 1.7 20 0"
+    result = evaluate_files(*write(tmp_path, [(label, f"{label} 0.9")]))
     record = result.to_json()
     assert list(record) == ["Car", "Pedestrian", "Cyclist"]
     assert list(record["Car"]) == ["iou", "3d", "bev", "2d", "aos"]
@@ -229,7 +230,8 @@ def test_json_and_table_name_the_protocol(tmp_path: Path) -> None:
     assert all(len(values) == 3 for values in record["Car"]["3d"].values())
     table = result.table()
     assert "easy, moderate, hard" in table and "papers quote 3d, moderate" in table
-    assert "fewer than 41 objects" in table and "read `all`" in table
+    assert "fewer than 41 objects: R40 and R11 of Car are capped, read `all`" in table
+    assert "the labels have no Cyclist" in table
 
 
 def test_nothing_found_is_zero_and_no_objects_is_unknown() -> None:

@@ -7,7 +7,7 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.ops.neighborhood import cpu, neighborhood_attention, reference
 from beambox.ops.neighborhood.windows import queries_of, window_start
-from oracles import attention
+from oracles import neighborhood as attention
 
 VERSIONS = pytest.mark.parametrize(
     "version", [reference.neighborhood_attention, cpu.neighborhood_attention], ids=["reference", "numba"]

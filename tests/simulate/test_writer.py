@@ -77,7 +77,7 @@ def test_bad_arguments_write_nothing(tmp_path) -> None:
         ({"frames": 1, "workers": 0}, "must be at least 1, got 1 and 0"),
         ({"frames": 1, "val_share": 1.5}, "`val_share` must be at least 0 and less than 1"),
         ({"frames": 1, "view": "side"}, "`view` must be camera or full, got 'side'"),
-        ({"frames": 1, "sensor": "hdl32"}, "`sensor` must be a preset or a .yaml file, got 'hdl32'"),
+        ({"frames": 1, "sensor": "hdl99"}, "`sensor` must be a preset or a .yaml file, got 'hdl99'"),
     ):
         with pytest.raises(BeamboxError, match=message):
             write_dataset(tmp_path / "d", **options)

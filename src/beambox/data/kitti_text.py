@@ -32,7 +32,7 @@ __all__ = [
 DONT_CARE = "DontCare"
 LABEL_COLUMNS = 15
 RESULT_COLUMNS = 16
-FARTHEST = 1e6
+FARTHEST = 1e9
 """No number of a label file is larger than this."""
 CALIBRATION_REMEDY = "boxes live in the camera's frame, so labels and the camera's view need it; points alone do not"
 # the object benchmark's key first, then those of the tracking benchmark and of the raw recordings
