@@ -44,10 +44,10 @@ def test_block_in_training_normalises_over_active_sites():
 @pytest.mark.parametrize("sites", [0, 1])
 @pytest.mark.parametrize("training", [True, False])
 def test_block_survives_almost_nothing(sites, training):
-    block = submanifold_block(3, 5).train(training)
+    block = submanifold_block(3, 16).train(training)
     x = SparseTensor.of(torch.ones(sites, 3), torch.zeros(sites, 4, dtype=torch.int64), (4, 4, 4), 1)
     out = block(x)
-    assert out.features.shape == (sites, 5)
+    assert out.features.shape == (sites, 16)
     out.features.sum().backward()
     assert block.conv.weight.grad is not None
 

@@ -136,7 +136,7 @@ class SparseBlock(nn.Module):
             assert mean is not None and variance is not None
             scale = self.norm.weight / torch.sqrt(variance + self.norm.eps)
             out = self.conv(x, scale, self.norm.bias - mean * scale)
-            return out.with_features(functional.relu(out.features, inplace=True))
+            return out.with_features(functional.relu(out.features, inplace=not out.features.requires_grad))
         out = self.conv(x)
         if len(out.features) < 2:  # batch statistics need two values
             features = functional.batch_norm(
