@@ -1,4 +1,4 @@
-"""`beambox data check|anchors`: look at a data set before training on it."""
+"""`beambox data check|anchors|voxels`: look at a data set before training on it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Look at a data set: read all of it and say what seems wrong, or propose anchors for it.",
+    help="Look at a data set: read all of it and say what seems wrong, propose anchors, count the points of voxels.",
 )
 
 DATA = Annotated[Path, typer.Argument(metavar="DATA", help="YAML file of a data set, or a KITTI or ONCE folder.")]
@@ -83,6 +83,37 @@ def anchors(data: DATA, split: SPLIT = "all", frames: FRAMES = None) -> None:
     print(proposals_text(proposals), end="")
 
 
+def voxels(
+    data: DATA,
+    split: SPLIT = "all",
+    frames: FRAMES = None,
+    cell: Annotated[str, typer.Option(metavar="X,Y,Z", help="Edge lengths of a voxel in metres.")] = "0.1,0.1,0.15",
+    out: Annotated[Path | None, typer.Option(help="Draw the histogram into this picture.")] = None,
+) -> None:
+    """Tell how many points a voxel holds: DenNet's figure 2 for any data set.
+
+    Examples:
+      beambox data voxels once --split val --frames 100 --cell 0.1,0.1,0.2 --out figure2.png
+    """
+    from beambox.checks import BeamboxError
+    from beambox.cli.console import progress
+    from beambox.data.opening import open_data
+    from beambox.visualise.canvas import save_picture
+    from beambox.visualise.voxel_histogram import draw_histogram, voxel_histogram
+
+    try:
+        x, y, z = (float(word) for word in cell.split(","))
+    except ValueError:
+        raise BeamboxError(f'--cell takes three lengths in metres, as 0.1,0.1,0.15; got "{cell}"') from None
+    source = open_data(data, split)
+    chosen = spread(len(source), frames)
+    sweeps = (source[index] for index in progress(chosen, len(chosen), "reading"))
+    histogram = voxel_histogram(sweeps, (x, y, z))
+    print(histogram.table(), end="")
+    if out is not None:
+        save_picture(draw_histogram(histogram, f"{data.name} {split}"), out)
+
+
 def spread(total: int, wanted: int | None) -> list[int]:
     """Return the positions of ``wanted`` frames, spread evenly over all; all of them where None."""
     if wanted is None or wanted >= total:
@@ -90,5 +121,5 @@ def spread(total: int, wanted: int | None) -> list[int]:
     return [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
 
 
-for function in (check, anchors):
+for function in (check, anchors, voxels):
     app.command(help=help_of(function))(guard(function))

@@ -46,7 +46,7 @@ def points_per_voxel(points: Tensor, cell: tuple[float, float, float]) -> Tensor
     """Count the points of each occupied voxel.
 
     Args:
-        points: ``(N, 3 or more)``; x, y, z in metres first.
+        points: ``(N, 3 or more)``; x, y, z in metres first; those that are not finite are left out.
         cell: edge lengths x, y, z of voxels, one of which has a corner at the origin.
 
     Returns:
@@ -54,8 +54,13 @@ def points_per_voxel(points: Tensor, cell: tuple[float, float, float]) -> Tensor
     """
     if min(cell) <= 0:
         raise BeamboxError(f"`cell` must be three lengths above 0, got {tuple(cell)}")
-    index = torch.floor(points[:, :3].double() / torch.tensor(cell, dtype=torch.float64)).long()  # (N, 3)
-    return index.unique(dim=0, return_counts=True)[1]
+    xyz = points[points[:, :3].isfinite().all(dim=1), :3].double()
+    index = torch.floor(xyz / torch.tensor(cell, dtype=torch.float64)).long()  # (N, 3)
+    key = torch.zeros(len(index), dtype=torch.int64)
+    for axis in index.unbind(dim=1):  # places along an axis are numbered first, so that one far point costs nothing
+        places, place = axis.unique(return_inverse=True)
+        key = key * len(places) + place
+    return key.unique(return_counts=True)[1]
 
 
 def voxel_histogram(frames: Iterable[Frame], cell: tuple[float, float, float], most: int = 10) -> VoxelHistogram:
