@@ -99,6 +99,13 @@ def test_numba_attention_does_not_depend_on_threads():
     assert all(torch.equal(one, two) for one, two in zip(*results))
 
 
+def test_bias_may_have_another_type_than_the_rest():
+    q, k, v, bias = case((1, 2, 7, 8, 4), 7, torch.float32)
+    out = neighborhood_attention(q, k, v, bias.double())
+    assert out.dtype == torch.float32
+    assert torch.equal(out, neighborhood_attention(q, k, v, bias))
+
+
 def test_attention_takes_what_is_not_contiguous_and_keeps_nothing_without_gradient():
     qkv = torch.randn(2, 9, 8, 3, 2, 4, generator=torch.Generator().manual_seed(2))
     q, k, v = qkv.permute(3, 0, 4, 1, 2, 5)

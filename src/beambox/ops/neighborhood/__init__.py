@@ -43,7 +43,7 @@ def neighborhood_attention(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, window
         q: ``(B, heads, H, W, d)`` queries, floating point.
         k: keys, of the same shape and type.
         v: values, of the same shape and type.
-        bias: ``(heads, 2 * window - 1, 2 * window - 1)``, of the same type.
+        bias: ``(heads, 2 * window - 1, 2 * window - 1)``; brought to the type of q, which autocast may have changed.
         window: odd edge length in pixels; H and W must not be smaller.
 
     Returns:
@@ -67,5 +67,5 @@ def neighborhood_attention(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, window
         expect_shape(name, tensor, q.shape)
         expect_dtype(name, tensor, q.dtype)
     expect_shape("bias", bias, (q.shape[1], 2 * window - 1, 2 * window - 1))
-    expect_dtype("bias", bias, q.dtype)
+    bias = bias.to(q.dtype)
     return choose("neighborhood_attention", BACKENDS, q, k, v, bias)(q, k, v, bias, window)
