@@ -11,7 +11,8 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.detectors.pointpillars import KITTI_PILLARS
 from beambox.geometry.axes import Axes
-from beambox.infer.doctor import Diagnosis, Trained, examine
+from beambox.infer.doctor import Diagnosis, examine
+from beambox.infer.trained import Trained
 from oracles.paths import data_dir
 from oracles.tiny_detector import street
 
@@ -109,7 +110,7 @@ def test_a_few_points_do_not_break_it(tmp_path: Path) -> None:
 
 
 def test_the_card_says_what_training_was_like() -> None:
-    trained = Trained.of({"sensor_height": 2.1, "intensity_mean": 0.4, "licence": "CC0"}, KITTI_PILLARS)
+    trained = Trained.of({"sensor height": 2.1, "intensity_mean": 0.4, "licence": "CC0"}, KITTI_PILLARS)
     assert (trained.sensor_height, trained.intensity_mean, trained.points) == (2.1, 0.4, 18_000)
 
 

@@ -29,7 +29,7 @@ def command(
       beambox demo
       beambox demo --frames 20 --seed 7 --out more
     """
-    from beambox.infer.demo import run_demo
+    from beambox.infer.demo import run_demo, short_table
     from beambox.infer.predictor import load
     from beambox.zoo import shipped
 
@@ -43,7 +43,7 @@ def command(
     detector = load(name, device=device)
     done = run_demo(detector, out, frames=frames, seed=seed, sensor=sensor, model=name, tell=print)
     print()
-    print(done.scores.table().rstrip())
+    print(short_table(done.scores))
     print()
-    print(f"pictures: {done.pictures[0].parent}; table: {out / 'scores.txt'}; results: {out / 'results'}")
+    print(f"pictures: {done.pictures[0].parent}; whole table: {out / 'scores.txt'}; results: {out / 'results'}")
     say(f"{done.objects} objects, {done.detections} found, {time.perf_counter() - start:.0f} s")

@@ -44,9 +44,10 @@ def command(
         report(environment())
         return
     from beambox.detectors.pointpillars import KITTI_PILLARS
-    from beambox.infer.doctor import Trained, examine
+    from beambox.infer.doctor import examine
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
+    from beambox.infer.trained import Trained
     from beambox.zoo import shipped
 
     names = list(shipped())

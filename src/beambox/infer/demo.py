@@ -17,7 +17,7 @@ from beambox.simulate import SimulatedSource
 from beambox.visualise.canvas import save_picture
 from beambox.visualise.picture import draw_sweep
 
-__all__ = ["Demo", "run_demo"]
+__all__ = ["Demo", "run_demo", "short_table"]
 
 
 @dataclass(frozen=True)
@@ -78,3 +78,12 @@ def run_demo(
     write_text(out / "scores.txt", scores.table())
     write_text(out / "scores.json", json.dumps(scores.to_json(), indent=2) + "\n")
     return Demo(scores, tuple(pictures), objects, found)
+
+
+def short_table(scores: KittiResult) -> str:
+    """Write one line a class: average precision over every recall, of the objects up to moderate difficulty."""
+    lines = [f"{'AP, %':<14}{'objects':>8}{'overlap':>9}{'3-D':>8}{'above':>8}"]
+    for one in scores.classes:
+        three, above = one.box3d[1].all_points, one.bev[1].all_points
+        lines.append(f"{one.name:<14}{one.objects[1]:>8}{one.iou:>9.2f}{three:>8.1f}{above:>8.1f}")
+    return "\n".join(lines)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,34 +14,14 @@ from torch import Tensor
 
 from beambox.data.reading import read_frame
 from beambox.data.road import fit_road_plane
-from beambox.geometry import VoxelGrid
 from beambox.geometry.axes import Axes
 from beambox.infer.corrections import Corrections
+from beambox.infer.trained import Trained
 from beambox.structures import Frame
 
-__all__ = ["Diagnosis", "Finding", "Trained", "examine"]
+__all__ = ["Diagnosis", "Finding", "examine"]
 
 Level = Literal["good", "note", "bad"]
-
-
-@dataclass(frozen=True)
-class Trained:
-    """What the training data of a set of weights looked like; the defaults are KITTI's."""
-
-    grid: VoxelGrid
-    """Region the network looks at."""
-    sensor_height: float = 1.73
-    """Metres of the sensor above the ground."""
-    intensity_mean: float = 0.23
-    """Mean intensity of the points."""
-    points: int = 18_000
-    """Points of a typical sweep that the network saw."""
-
-    @classmethod
-    def of(cls, card: Mapping[str, Any], grid: VoxelGrid) -> Trained:
-        """Read what a card says; what it does not say is taken to be KITTI's."""
-        known = {key: card[key] for key in ("sensor_height", "intensity_mean", "points") if key in card}
-        return cls(grid, **known)
 
 
 @dataclass(frozen=True)

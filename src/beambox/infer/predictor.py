@@ -22,6 +22,7 @@ from beambox.infer.corrections import Corrections
 from beambox.infer.fusion import fold_batch_norms
 from beambox.infer.inputs import Sweep, read_sweep
 from beambox.infer.precision import choose_device, choose_precision
+from beambox.infer.trained import Trained
 from beambox.structures import Batch, Detections, Frame
 from beambox.zoo import shipped
 
@@ -33,8 +34,6 @@ Input = str | Path | np.ndarray | Tensor | Frame
 View = Literal["auto", "camera", "full"]
 VIEWS = ("auto", "camera", "full")
 
-KITTI_SENSOR_HEIGHT = 1.73
-"""Metres above the ground of KITTI's Velodyne; taken where a card does not say otherwise."""
 STRIDE = 8
 """Regions are rounded to this many cells, the coarsest step of the networks' backbones."""
 
@@ -297,7 +296,7 @@ def load(
     chosen = choose_device(device)
     model: Any = load_weights(path, "cpu")
     card = read_weights(path).card
-    trained = float(card.get("sensor_height", KITTI_SENSOR_HEIGHT))
+    trained = Trained.of(card, model.config.grid).sensor_height
     corrections = Corrections(
         axes=Axes.parse(axes) if isinstance(axes, str) else axes or Axes(),
         raise_by=0.0 if sensor_height is None else sensor_height - trained,

@@ -114,10 +114,10 @@ def draw_bev(
     height = max(height, 420)  # the legend needs this much
     canvas = Canvas(width + PANEL_WIDTH, height, BACKGROUND)
     limits = _draw_points(canvas, view, frame, colour_by)
-    _draw_rings(canvas, view)
+    written = _draw_rings(canvas, view)
     if looked_at is not None:
         _draw_border(canvas, view, looked_at)
-    tags = Tags(canvas, width, height, _outline(view, torch.cat(boxes)) if boxes else None)
+    tags = Tags(canvas, width, height, [*written, *(_outline(view, torch.cat(boxes)) if boxes else ())])
     if detections is not None:
         _draw_detections(canvas, view, detections)
     if labels is not None:
@@ -149,10 +149,12 @@ def _draw_points(canvas: Canvas, view: _Map, frame: Frame, colour_by: ColourBy) 
     return low, high
 
 
-def _draw_rings(canvas: Canvas, view: _Map) -> None:
+def _draw_rings(canvas: Canvas, view: _Map) -> list[NDArray[np.floating]]:
+    """Draw circles of distance; return the corners of their labels."""
     r = view.region
     far = math.hypot(max(abs(r.x_min), abs(r.x_max)), max(abs(r.y_min), abs(r.y_max)))
     step = 10 if far <= 110 else 20
+    written: list[NDArray[np.floating]] = []
     centre = view.pixels(np.array([0.0, 0.0]))
     u, v = float(centre[0]), float(centre[1])
     for distance in range(step, int(far) + 1, step):
@@ -161,8 +163,10 @@ def _draw_rings(canvas: Canvas, view: _Map) -> None:
         at = at if at > 8 else v + distance * view.scale
         if 8 < at < view.size[1] - 8:
             canvas.text((u + 4, at), f"{distance} m", MUTED, size=11, behind=BACKGROUND)
+            written.append(np.array([(u + 4, at - 6), (u + 34, at + 6)]))
     nose, left, right = (u, v - 9), (u - 6, v + 6), (u + 6, v + 6)
     canvas.polygon((nose, left, (u, v + 3), right), TEXT)
+    return written
 
 
 def _draw_border(canvas: Canvas, view: _Map, looked_at: Region) -> None:

@@ -18,9 +18,7 @@ Space = tuple[float, float, float, float]
 class Tags:
     """Places words on a canvas; a tag without room is left out, so the most important come first."""
 
-    def __init__(
-        self, canvas: Canvas, width: int, height: int, boxes: Iterable[NDArray[np.floating]] | None = None
-    ) -> None:
+    def __init__(self, canvas: Canvas, width: int, height: int, boxes: Iterable[NDArray[np.floating]] = ()) -> None:
         """Start with nothing written.
 
         Args:
@@ -31,11 +29,11 @@ class Tags:
         """
         self.canvas, self.width, self.height = canvas, width, height
         self._taken: list[Space] = []
-        for corners in boxes if boxes is not None else ():
+        for corners in boxes:
             (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
             self._taken.append((u0, v0, u1, v1))
 
-    def beside(self, outlines: Sequence[NDArray[np.floating]], words: Sequence[tuple[str, Colour]]) -> None:
+    def beside(self, outlines: Iterable[NDArray[np.floating]], words: Sequence[tuple[str, Colour]]) -> None:
         """Write right, left, above or below boxes of ``(K, 2)`` corners, in pixels."""
         for corners, (text, colour) in zip(outlines, words):
             half, tall = self._half_size(text, 11)
@@ -44,7 +42,7 @@ class Tags:
             places = ((u1 + half + 4, v), (u0 - half - 4, v), (u, v0 - tall - 2), (u, v1 + tall + 2))
             self._write(places, text, colour, 11)
 
-    def above(self, outlines: Sequence[NDArray[np.floating]], words: Sequence[tuple[str, Colour]]) -> None:
+    def above(self, outlines: Iterable[NDArray[np.floating]], words: Sequence[tuple[str, Colour]]) -> None:
         """Write above boxes of ``(K, 2)`` corners, or below them, in pixels."""
         for corners, (text, colour) in zip(outlines, words):
             _, tall = self._half_size(text, 13)
