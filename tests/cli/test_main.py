@@ -56,8 +56,8 @@ def test_an_unknown_option_is_a_short_error(capsys: pytest.CaptureFixture[str]) 
         (KeyboardInterrupt(), 130, "beambox: interrupted; files already written are whole and stay\n"),
         (OSError(errno.ENOSPC, "No space left on device", "out/a.json"), 2,
          "beambox: out/a.json: No space left on device; free some space or give another folder\n"),
-        (PermissionError(errno.EACCES, "Permission denied", "/root/x"), 2,
-         "beambox: /root/x: Permission denied; give a folder that may be written\n"),
+        (PermissionError(errno.EACCES, "Permission denied", "/elsewhere/x"), 2,
+         "beambox: /elsewhere/x: Permission denied; give a folder that may be written\n"),
     ],
 )  # fmt: skip
 def test_what_a_user_can_cause_is_one_line(
