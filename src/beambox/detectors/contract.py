@@ -13,7 +13,7 @@ from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["DetectorConfig", "DetectorModel", "detections_from"]
+__all__ = ["DetectorConfig", "DetectorModel", "detections_from", "targets_from"]
 
 
 class DetectorConfig(Protocol):
@@ -66,3 +66,12 @@ class DetectorModel(Protocol[P]):
 def detections_from(kept: Sequence[tuple[Tensor, Tensor, Tensor]], classes: tuple[str, ...]) -> list[Detections]:
     """Wrap (boxes, scores, labels) of each sample."""
     return [Detections(boxes, scores, labels.to(torch.int64), classes) for boxes, scores, labels in kept]
+
+
+def targets_from(
+    labels: Sequence[Labels], classes: tuple[str, ...], device: torch.device
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Return each sample's boxes ``(M, 7)`` and class positions ``(M,)``; objects of other classes are left out."""
+    known = [of_sample.of_classes(classes) for of_sample in labels]
+    boxes = [of_sample.boxes.to(device) for of_sample in known]
+    return boxes, [of_sample.class_index(classes).to(device) for of_sample in known]

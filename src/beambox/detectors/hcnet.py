@@ -43,7 +43,7 @@ import torch
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError
-from beambox.detectors.contract import detections_from
+from beambox.detectors.contract import detections_from, targets_from
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import AnchorClass, AnchorGrid
 from beambox.layers.attention import (
@@ -200,16 +200,9 @@ class HCNet(nn.Module):
 
     def loss(self, predictions: AnchorPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
         """Return the weighted losses ``cls``, ``loc`` and ``direction``; objects of other classes are background."""
-        device = predictions.cls.device
-        known = [of_sample.of_classes(self.config.classes) for of_sample in labels]
-        return anchor_loss(
-            predictions,
-            [of_sample.boxes.to(device) for of_sample in known],
-            [of_sample.class_index(self.config.classes).to(device) for of_sample in known],
-            self.anchors,
-            self.config.loss,
-            self.config.smooth_l1_beta,
-        )
+        config = self.config
+        boxes, classes = targets_from(labels, config.classes, predictions.cls.device)
+        return anchor_loss(predictions, boxes, classes, self.anchors, config.loss, config.smooth_l1_beta)
 
     def decode(self, predictions: AnchorPredictions) -> list[Detections]:
         """Return the detections of each sample, best first."""

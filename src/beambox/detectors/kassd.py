@@ -41,7 +41,7 @@ import torch
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError
-from beambox.detectors.contract import detections_from
+from beambox.detectors.contract import detections_from, targets_from
 from beambox.detectors.second import KITTI_VOXELS, STRIDE
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, AnchorClass, AnchorGrid
@@ -240,10 +240,8 @@ class Kassd(nn.Module):
 
         Objects of other classes are background.
         """
-        config, device = self.config, predictions.head.cls.device
-        known = [of_sample.of_classes(config.classes) for of_sample in labels]
-        boxes = [of_sample.boxes.to(device) for of_sample in known]
-        classes = [of_sample.class_index(config.classes).to(device) for of_sample in known]
+        config = self.config
+        boxes, classes = targets_from(labels, config.classes, predictions.head.cls.device)
         losses = anchor_loss(predictions.head, boxes, classes, self.anchors, config.loss_weights, config.smooth_l1_beta)
         if predictions.maps is not None:
             terms = [self.keypoint_loss(predictions, i, *of_sample) for i, of_sample in enumerate(zip(boxes, classes))]

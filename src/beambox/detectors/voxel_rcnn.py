@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, expect_same_length
-from beambox.detectors.contract import detections_from
+from beambox.detectors.contract import detections_from, targets_from
 from beambox.detectors.second import KITTI_VOXELS, ONCE_VOXELS, STRIDE
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass, AnchorGrid
@@ -204,10 +204,7 @@ class TwoStage(nn.Module):
             generator: source of randomness for drawing regions; PyTorch's default one where None.
         """
         first = predictions.first
-        device = first.cls.device
-        known = [of_sample.of_classes(self.config.classes) for of_sample in labels]
-        boxes = [of_sample.boxes.to(device) for of_sample in known]
-        classes = [of_sample.class_index(self.config.classes).to(device) for of_sample in known]
+        boxes, classes = targets_from(labels, self.config.classes, first.cls.device)
         losses = anchor_loss(first, boxes, classes, self.anchors, self.config.loss, self.config.smooth_l1_beta)
         targets = sample_rois(predictions.rois, boxes, classes, self.config.sampling, generator)
         refined = self.refine(targets.rois, predictions.levels, first.grid)
