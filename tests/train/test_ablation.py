@@ -11,13 +11,14 @@ from typer.testing import CliRunner
 
 from beambox.checks import BeamboxError
 from beambox.cli import ablate
+from beambox.data.database import ObjectDatabase
 from beambox.data.source import FrameSource
 from beambox.detectors.catalogue import CATALOGUE, config_from_dict
 from beambox.metrics.kitti_result import AveragePrecision, ClassResult, KittiResult
 from beambox.train import ablation
 from beambox.train.ablation import Interrupted, Timed, merged, report, row_recipe, run_table, to_json, value_at
 from beambox.train.config import Recipe, parse_recipe, read_recipe
-from beambox.train.sources import open_source
+from beambox.train.sources import open_source, shared_database
 from beambox.train.tables import TABLES, Column, Row, Table, levels, table_of
 from oracles import tiny_training
 
@@ -38,6 +39,8 @@ TINY = Table(
     ),
     remarks=("a remark",),
 )
+
+LESS = ({"kind": "kitti", "frames": 2},)
 
 
 def tiny_recipe() -> Recipe:
@@ -105,9 +108,9 @@ def test_rows_of_a_seed_start_from_the_same_random_numbers(tmp_path: Path, opene
 def test_an_interrupted_run_goes_on(tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     resumed: list[bool] = []
 
-    def stopped(*args: Any, resume: bool) -> Any:
+    def stopped(*args: Any, resume: bool, **rest: Any) -> Any:
         resumed.append(resume)
-        outcome = train(*args, resume=resume)
+        outcome = train(*args, resume=resume, **rest)
         return replace(outcome, finished=len(resumed) > 1)
 
     train = ablation.train
@@ -118,6 +121,58 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, opened: list[str], monkeypat
     (folder / "final.safetensors").unlink()  # a stopped run has a checkpoint and no final weights
     run_table(TINY, tiny_recipe(), None, tmp_path, [0], lambda _: None)
     assert resumed[:2] == [False, True]
+
+
+@pytest.fixture
+def cut(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sources of objects are in memory too; returns the number of frames of each that was cut up."""
+    lengths: list[int] = []
+
+    def in_memory(section: Any, data: Path | None) -> FrameSource:
+        return tiny_training.frames(section.frames or 3)
+
+    def counted(source: FrameSource, *rest: Any) -> ObjectDatabase:
+        lengths.append(len(source))
+        return build(source, *rest)
+
+    build = ObjectDatabase.build
+    monkeypatch.setattr("beambox.train.sources.open_source", in_memory)
+    monkeypatch.setattr("beambox.train.sources.ObjectDatabase.build", counted)
+    return lengths
+
+
+def test_objects_are_cut_once_for_all_rows_and_seeds(tmp_path: Path, opened: list[str], cut: list[int]) -> None:
+    plain = tiny_recipe().model_dump(mode="python")
+    sampling = parse_recipe({**plain, "augment": {"sample": {"Car": 1}}})
+    run_table(TINY, sampling, tmp_path, tmp_path / "out", [0, 1], lambda _: None)
+    assert cut == [3]
+    assert len(list((tmp_path / "out").rglob("*.npz"))) == 1
+    run_table(TINY, sampling, tmp_path, tmp_path / "out", [2], lambda _: None)
+    assert cut == [3]
+    shorter = parse_recipe({**plain, "name": "shorter", "augment": {"sample": {"Car": 1}}, "data": LESS})
+    run_table(TINY, shorter, tmp_path, tmp_path / "out", [0], lambda _: None)
+    assert cut == [3, 2]
+
+
+def test_shared_objects_are_named_by_what_they_depend_on(tmp_path: Path, cut: list[int]) -> None:
+    def name(folder: str = "a", **changes: Any) -> Path | None:
+        plain = tiny_recipe().model_dump(mode="python") | {"augment": {"sample": {"Car": 1}}} | changes
+        return shared_database(parse_recipe(plain), tmp_path / folder, tmp_path)
+
+    first = name()
+    assert first is not None
+    assert first.parent == tmp_path
+    same = [name(seed=3), name(augment={"sample": {"Car": 9}, "rotation": 0.1}), name("b/../a")]
+    assert same == [first] * 3
+    others = [
+        name("b"),
+        name(data=LESS),
+        name(augment={"sample": {"Car": 1, "Van": 1}}),
+        name(augment={"sample": {"Van": 1, "Car": 1}}),
+        name(augment={"sample": {"Car": 1}, "object_min_points": 9}),
+    ]
+    assert len({first, *others}) == 6
+    assert name(augment=None) is None
 
 
 def test_runs_of_another_recipe_are_not_taken_for_these(tmp_path: Path, opened: list[str]) -> None:

@@ -21,7 +21,7 @@ from beambox.metrics import once
 from beambox.structures import Detections, Frame
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.loop import FINAL, LAST, train
-from beambox.train.sources import open_source
+from beambox.train.sources import open_source, shared_database
 from beambox.train.tables import Table
 
 __all__ = ["Interrupted", "Measured", "report", "run_table", "to_json"]
@@ -48,7 +48,8 @@ def run_table(
     """Train and score every row of a table for every seed.
 
     Each run has a folder of its own under ``out``, named by its switches and seed; what is there already is not
-    repeated, and rows that two tables share are trained once. The weights after the last step are scored, on the
+    repeated, and rows that two tables share are trained once. Objects for sampling are cut out of the data once for all
+    runs that sample the same ones, into ``out``. The weights after the last step are scored, on the
     recipe's validation source: nothing is chosen by the numbers that are printed.
 
     Args:
@@ -76,7 +77,7 @@ def run_table(
     for number, (row, seed, plan) in enumerate(plans, 1):
         folder = out / recipe.name / folder_name(row.options or {}) / f"seed-{seed}"
         say(f"row {row.name}, seed {seed} ({number} of {len(plans)}): {folder}")
-        scores = run_row(plan, recipe, source, data, folder)
+        scores = run_row(plan, recipe, source, data, folder, out)
         measured[row.name].append([value_at(scores, column.path) for column in table.columns])
     return measured
 
@@ -106,15 +107,19 @@ def folder_name(options: Mapping[str, Any]) -> str:
     return re.sub(r"[^A-Za-z0-9=_.]+", "-", told.replace('"', ""))[:60].strip("-") + "_" + exact
 
 
-def run_row(plan: Recipe, recipe: Recipe, source: FrameSource, data: Path | None, folder: Path) -> dict[str, Any]:
+def run_row(
+    plan: Recipe, recipe: Recipe, source: FrameSource, data: Path | None, folder: Path, out: Path
+) -> dict[str, Any]:
     """Train one run, or go on with it, and score its last weights; returns the scores."""
     identity = plan.model_dump(mode="json", exclude={"workers", "threads", "log_every", "save_every", "description"})
     claim(folder, identity)
     scored = folder / "scores.json"
     if scored.is_file():
         return json.loads(scored.read_text(encoding="utf-8"))
-    if not (folder / FINAL).is_file() and not train(plan, data, folder, resume=(folder / LAST).exists()).finished:
-        raise Interrupted
+    if not (folder / FINAL).is_file():
+        objects = shared_database(plan, data, out)
+        if not train(plan, data, folder, resume=(folder / LAST).exists(), shared_objects=objects).finished:
+            raise Interrupted
     assert recipe.validation is not None
     scores = score(load_weights(folder / FINAL), source, recipe)
     write_json(scored, scores)

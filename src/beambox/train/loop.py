@@ -252,7 +252,9 @@ def stopping() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) -> Outcome:
+def train(
+    recipe: Recipe, data: Path | None, out: Path, resume: bool = False, shared_objects: Path | None = None
+) -> Outcome:
     """Train a detector.
 
     Args:
@@ -261,6 +263,7 @@ def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) ->
         out: folder of the run; gets ``last.safetensors`` (to go on from), ``best.safetensors`` and
             ``final.safetensors`` (weights to use), ``log.jsonl`` and ``tensorboard/``.
         resume: go on from ``last.safetensors`` instead of starting afresh.
+        shared_objects: object database to use, and to cut first where it is not there; by default the run's own.
 
     Raises:
         BeamboxError: for anything in the recipe, the data or the folder that cannot be used.
@@ -270,7 +273,8 @@ def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) ->
     if recipe.threads:
         torch.set_num_threads(recipe.threads)
     fabric = make_fabric(recipe.precision)
-    run = assemble(recipe, data, out, fabric, reuse=resume)
+    reuse = resume or shared_objects is not None
+    run = assemble(recipe, data, out, fabric, shared_objects or out / OBJECTS, reuse)
     changed = run.restore() if resume else []
     log = RunLog(out, run.total, run.step, active=fabric.global_rank == 0)
     try:
@@ -294,7 +298,7 @@ def train(recipe: Recipe, data: Path | None, out: Path, resume: bool = False) ->
         log.close()
 
 
-def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, reuse: bool = False) -> Run:
+def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, objects: Path, reuse: bool) -> Run:
     """Build the detector, the stream of batches and the validation that a recipe asks for.
 
     Args:
@@ -302,7 +306,8 @@ def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, reuse
         data: folder that ``{data}`` stands for.
         out: folder of the run.
         fabric: devices and processes.
-        reuse: take the object database that lies in the folder already.
+        objects: file of the object database, where the recipe samples objects.
+        reuse: take that file if it is there already.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
@@ -317,9 +322,9 @@ def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, reuse
     database = None
     if recipe.augment and recipe.augment.sample:
         if fabric.global_rank == 0:
-            open_database(recipe, data, out / OBJECTS, reuse, lambda text: print(text, flush=True))
+            open_database(recipe, data, objects, reuse, lambda text: print(text, flush=True))
         fabric.barrier()
-        database = ObjectDatabase.load(out / OBJECTS)
+        database = ObjectDatabase.load(objects)
     feed = Feed(
         MixedSource(sources, weights or None),
         Change(recipe.augment, database, recipe.seed),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from beambox.data.source import FrameSource, SubsetSource
 from beambox.structures import Frame
 from beambox.train.config import AugmentSection, Recipe, SourceSection
 
-__all__ = ["Change", "open_database", "open_source"]
+__all__ = ["Change", "open_database", "open_source", "shared_database"]
 
 
 def open_source(section: SourceSection, data: Path | None) -> FrameSource:
@@ -82,6 +84,36 @@ OPENERS: dict[str, Callable[[SourceSection, Path | None], FrameSource]] = {
 }
 
 
+def object_sources(recipe: Recipe, data: Path | None) -> list[tuple[SourceSection, FrameSource]]:
+    """Open the sources whose objects are sampled, with whole sweeps.
+
+    An object cut by the image's border is complete in the LiDAR's view.
+    """
+    sections = [section for section in recipe.data if section.objects]
+    return [(section, open_source(section.model_copy(update={"camera_view": False}), data)) for section in sections]
+
+
+def shared_database(recipe: Recipe, data: Path | None, folder: Path) -> Path | None:
+    """Name the object database that every run with these objects can use; None where the recipe samples none.
+
+    The name holds a digest of all that the objects depend on: sources and their frames, classes, and points asked for.
+
+    Args:
+        recipe: of one of the runs.
+        data: folder that ``{data}`` stands for.
+        folder: where such databases lie.
+    """
+    if recipe.augment is None or not recipe.augment.sample:
+        return None
+    sources = [
+        [section.model_dump(mode="json", exclude={"weight", "camera_view"}), list(source.ids)]
+        for section, source in object_sources(recipe, data)
+    ]
+    where = None if data is None else str(data.resolve())
+    told = [where, sources, list(recipe.augment.sample), recipe.augment.object_min_points]
+    return folder / f"objects-{hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]}.npz"
+
+
 def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, say: Callable[[str], None]) -> None:
     """Cut the objects for sampling out of the recipe's sources into ``file``.
 
@@ -96,11 +128,7 @@ def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, sa
     if reuse and file.exists():
         return
     parts = []
-    for section in recipe.data:
-        if not section.objects:
-            continue
-        # whole sweeps: an object cut by the image's border is complete in the LiDAR's view
-        source = open_source(section.model_copy(update={"camera_view": False}), data)
+    for section, source in object_sources(recipe, data):
         say(f"cutting objects out of the {len(source)} frames of {section.path} {section.split}")
         parts.append(ObjectDatabase.build(source, tuple(recipe.augment.sample), recipe.augment.object_min_points))
     if not parts:
