@@ -107,3 +107,12 @@ def test_batch_without_objects_trains(tmp_path: Path) -> None:
     empty = TrainingBatch(replace(work.batch, labels=(Labels.empty(),) * 2), work.grid)
     losses, _ = run.advance(empty, Clock())
     assert torch.isfinite(losses["total"])
+
+
+def test_dense_layers_are_compiled_where_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[torch.nn.Module] = []
+    monkeypatch.setattr(torch.nn.Module, "compile", lambda layer, **_: compiled.append(layer))
+    tiny_run(tmp_path, recipe())
+    assert compiled == []
+    run = tiny_run(tmp_path, recipe().model_copy(update={"compile": True}))
+    assert compiled == list(run.detector.dense)

@@ -42,6 +42,11 @@ class DetectorModel(Protocol[P]):
 
     config: Any
 
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps: what it pays to compile, as training does with ``compile: true``."""
+        ...
+
     def __call__(self, batch: Batch, grid: VoxelGrid | None = None) -> P:
         """Predict. ``grid``: another region with cells of the same size; the configured one where None."""
         ...

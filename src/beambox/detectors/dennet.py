@@ -189,6 +189,12 @@ class DenNet(TwoStage):
         bev = self.backbone(maps)  # (B, 256, ny / 8, nx / 8)
         return self.detect(stages, bev, grid)
 
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps; neighbourhood attention has kernels of its own, which nothing can compile."""
+        layers = [layer for stage in self.backbone.stages for layer in stage.children()]
+        return (*(layer for layer in layers if not isinstance(layer, NeighborhoodBlock)), *self.backbone.ups)
+
 
 class AttentiveBackbone(BevBackbone):
     """Voxel R-CNN's 2-D network with both attentions in every stage (DenNet, section 3.3.2, figure 6).

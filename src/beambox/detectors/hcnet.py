@@ -190,6 +190,11 @@ class HCNet(nn.Module):
         adapted = self.adapt(bev, image)  # (B, 2 * 128, ny / 2, nx / 2)
         return self.head(adapted, grid)
 
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps."""
+        return self.backbone, self.adapt
+
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""
         config = self.config

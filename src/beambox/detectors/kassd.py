@@ -229,6 +229,11 @@ class Kassd(nn.Module):
         maps = None if self.kam is None else self.kam(bev)  # (B, K, ny / 8, nx / 8)
         return KassdPredictions(self.head(bev, grid), maps)
 
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps."""
+        return (self.neck,)
+
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""
         config = self.config

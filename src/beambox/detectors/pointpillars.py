@@ -125,6 +125,11 @@ class PointPillars(nn.Module):
         bev = self.backbone(image)  # (B, 3 * 128, ny / 2, nx / 2)
         return self.head(bev, grid)
 
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps."""
+        return (self.backbone,)
+
     def pillars(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into pillars."""
         config = self.config

@@ -133,6 +133,11 @@ class Second(nn.Module):
         bev = self.backbone(stages.bev)  # (B, 512, ny / 8, nx / 8)
         return self.head(bev, grid)
 
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps."""
+        return (self.backbone,)
+
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""
         config = self.config

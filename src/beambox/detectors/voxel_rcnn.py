@@ -161,6 +161,9 @@ class VoxelRcnnPredictions:
 class TwoStage(nn.Module):
     """What Voxel R-CNN shares with its successors: all but the 2-D network and what feeds it."""
 
+    backbone: BevBackbone
+    """The 2-D network, which a successor sets."""
+
     def __init__(self, config: VoxelRcnnConfig) -> None:
         super().__init__()
         self.config = config
@@ -181,6 +184,11 @@ class TwoStage(nn.Module):
         levels = tuple(by_stride[level.stride] for level in self.config.pooling)
         refined = None if self.training else self.refine(rois, levels, grid)
         return VoxelRcnnPredictions(first, rois, levels, refined)
+
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps."""
+        return (self.backbone,)
 
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""

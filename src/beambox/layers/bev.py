@@ -9,16 +9,24 @@ from torch import Tensor, nn
 
 from beambox.checks import expect_same_length
 
-__all__ = ["BevBackbone", "conv_bn_relu", "deconv_bn_relu"]
+__all__ = ["BevBackbone", "MapBlock", "conv_bn_relu", "deconv_bn_relu"]
 
 BN_EPS = 1e-3
 BN_MOMENTUM = 0.01
 
 
-def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+class MapBlock(nn.Sequential):
+    """A convolution of maps, batch norm, ReLU."""
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, C, Y, X)`` to ``(B, channels, Y', X')``."""
+        return super().forward(bev)  # torch.compile passes over the forward of torch's own class and enters this one
+
+
+def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> MapBlock:
     """Convolution that keeps the size (divided by ``stride``), batch norm (eps 1e-3, momentum 0.01), ReLU."""
     padding = dilation * (kernel // 2)
-    return nn.Sequential(
+    return MapBlock(
         nn.Conv2d(in_channels, channels, kernel, stride, padding, dilation, bias=False),
         nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
         nn.ReLU(inplace=True),
@@ -27,9 +35,9 @@ def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int =
 
 def deconv_bn_relu(
     in_channels: int, channels: int, kernel: int, stride: int, padding: int = 0, output_padding: int = 0
-) -> nn.Sequential:
+) -> MapBlock:
     """Transposed convolution that enlarges by ``stride``, batch norm, ReLU."""
-    return nn.Sequential(
+    return MapBlock(
         nn.ConvTranspose2d(in_channels, channels, kernel, stride, padding, output_padding, bias=False),
         nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
         nn.ReLU(inplace=True),

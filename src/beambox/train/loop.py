@@ -92,9 +92,8 @@ class Run:
         self.ema = Ema(detector, recipe.ema.decay) if recipe.ema else None
         self.names = {parameter: name for name, parameter in detector.named_parameters()}
         if recipe.compile:
-            for layer in detector.modules():
-                if type(layer).__name__ == "BevBackbone":
-                    layer.compile()
+            for layer in self.detector.dense:
+                layer.compile(dynamic=False)  # every step has maps of the same size
 
     @property
     def result(self) -> nn.Module:
