@@ -26,6 +26,20 @@ def test_presets_have_their_beams(name: str, beams: int) -> None:
     assert sensor.name == name
 
 
+def test_presets_follow_their_makers_tables() -> None:
+    """First and last angles and steps of HDL-32E and Pandar40; of Pandar64 some channels of Hesai's driver."""
+    hdl32, pandar40, pandar64 = (np.array(SENSORS[name].elevations) for name in ("hdl32", "pandar40", "pandar64"))
+    assert hdl32[[0, 8, 31]].tolist() == [10.667, 0.0, -30.667]
+    assert np.allclose(np.diff(hdl32), -4 / 3, atol=1e-3)
+    assert pandar40[[0, 1, 2, 3, 4, 5, 11, 29]].tolist() == [15, 11, 8, 5, 3, 2, 0, -6]
+    assert np.allclose(np.diff(pandar40[5:30]), -1 / 3, atol=1e-3)
+    assert pandar40[30:].tolist() == [-7, -8, -9, -10, -11, -12, -13, -14, -19, -25]
+    assert pandar64[[0, 5, 17, 53, 63]].tolist() == [14.882, 2.028, 0.0, -6.061, -24.897]
+    assert np.abs(np.diff(pandar64[5:54]) + 1 / 6).max() < 0.01
+    for table in (hdl32, pandar40, pandar64):
+        assert (np.diff(table) < 0).all()
+
+
 def test_own_sensor_from_yaml_is_cast(tmp_path) -> None:
     path = tmp_path / "tiny.yaml"
     path.write_text("elevations: [-4, -8, -12]\nazimuth_step: 0.5\nheight: 2.4\nmax_range: 60\nrange_noise: 0\n")

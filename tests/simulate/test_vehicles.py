@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from beambox.simulate import people, vehicles
+from beambox.simulate.fleets import SIZES, draw_size
 from beambox.simulate.ground import Ground
 from beambox.simulate.materials import AIR, GLASS, Palette
 from beambox.simulate.raycast import Placed, cast, pack
-from beambox.simulate.stage import SIZES, draw_size
 from oracles.marching import depth_inside, to_local
 
 FAR = Ground(-300.0, (0.0, 0.0), (0.0, 0.0), np.zeros((0, 4)), (), roughness=(0.0, 0.0, 0.0))
@@ -17,6 +17,7 @@ BUILDERS = {
     "Car": vehicles.car,
     "Van": vehicles.van,
     "Truck": vehicles.truck,
+    "Bus": vehicles.bus,
     "Tram": vehicles.tram,
     "Misc": vehicles.trailer,
     "Pedestrian": people.pedestrian,

@@ -11,10 +11,16 @@ __all__ = ["command"]
 
 
 def command(
-    out: Annotated[Path, typer.Argument(help="folder to write, in KITTI's layout")],
+    out: Annotated[Path, typer.Argument(help="folder to write")],
     frames: Annotated[int, typer.Option(help="how many sweeps", min=1)] = 100,
-    sensor: Annotated[str, typer.Option(help="preset such as hdl64, or a .yaml file")] = "hdl64",
-    view: Annotated[str, typer.Option(help="camera (the front camera's view) or full (the whole turn)")] = "camera",
+    files: Annotated[
+        str,
+        typer.Option("--format", help="layout of the files: kitti, or once (whole turns, its axes and five classes)"),
+    ] = "kitti",
+    sensor: Annotated[
+        str, typer.Option(help="preset (hdl64, hdl32, pandar40, pandar64) or .yaml file [hdl64; once: pandar40]")
+    ] = "",
+    view: Annotated[str, typer.Option(help="camera (what the front camera sees) or full (the whole turn)")] = "",
     layout: Annotated[
         str, typer.Option(help="random, kitti:PATH (real layouts) or mixed:PATH (half of each)")
     ] = "random",
@@ -23,7 +29,10 @@ def command(
     ] = "train",
     seed: Annotated[int, typer.Option(help="same seed, same data", min=0)] = 0,
     workers: Annotated[int, typer.Option(help="processes", min=1)] = 1,
-    val_share: Annotated[float, typer.Option(help="share of the sweeps listed in ImageSets/val.txt")] = 0.1,
+    val_share: Annotated[
+        float, typer.Option(help="share of the sweeps (once: of the sequences) listed in ImageSets/val.txt")
+    ] = 0.1,
+    sequence_length: Annotated[int, typer.Option(help="once: sweeps in one sequence", min=1)] = 10,
 ) -> None:
     """Simulate labelled LiDAR sweeps. An interrupted or shorter data set is continued by the same command."""
     from rich.console import Console
@@ -33,13 +42,18 @@ def command(
     from beambox.simulate import write_dataset
 
     console = Console(stderr=True)
-    console.print(f"beambox {__version__}: {frames} frames of {sensor}, view {view}, layout {layout}, seed {seed}")
+    told = ", ".join(f"{name} {value}" for name, value in (("sensor", sensor), ("view", view)) if value)
+    console.print(
+        f"beambox {__version__}: {frames} frames in the layout of {files.upper()}, {told + ', ' if told else ''}"
+        f"layout {layout}, seed {seed}"
+    )
     columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("simulating", total=frames)
         split = None if layout_split == "all" else layout_split
         write_dataset(
-            out, frames, sensor, view, layout, seed, workers, val_share, split,
+            out, frames, sensor or None, view or None, layout, seed, workers, val_share, split,
             lambda done, total: bar.update(task, completed=done, total=total),
+            files=files, sequence_length=sequence_length,
         )  # fmt: skip
     console.print(f"wrote {frames} frames to {out}")

@@ -228,13 +228,17 @@ def _mapped(word: str, mapping: Mapping[str, str | None], where: str) -> str | N
     return mapping[word]
 
 
-def write_once_sequence(root: Path | str, sequence: str, frames: Iterable[Frame]) -> int:
+def write_once_sequence(
+    root: Path | str, sequence: str, frames: Iterable[Frame], cameras: Mapping[str, Any] | None = None
+) -> int:
     """Write frames as one sequence, the JSON file last; points and boxes keep their axes.
 
     Args:
         root: folder that gets ``data/SEQUENCE``.
         sequence: name of the sequence.
         frames: each with an id; frames without labels get no ``annos``. They are taken one at a time.
+        cameras: name -> ``{"cam_to_velo", "cam_intrinsic", "distortion"}``, the file's ``calib``. Every box gets the
+            2-D box -1 -1 -1 -1 in each of them, ONCE's sign for an object that the camera does not show.
 
     Returns:
         How many frames were written.
@@ -252,9 +256,10 @@ def write_once_sequence(root: Path | str, sequence: str, frames: Iterable[Frame]
         entry: dict[str, Any] = {"sequence_id": sequence, "frame_id": frame.id, "pose": [0, 0, 0, 1, 0, 0, 0]}
         if frame.labels is not None:
             boxes = frame.labels.boxes.double().tolist()
-            entry["annos"] = {"names": list(frame.labels.names), "boxes_3d": boxes, "boxes_2d": {}}
+            unseen = {name: [[-1.0] * 4] * len(boxes) for name in cameras or {}}
+            entry["annos"] = {"names": list(frame.labels.names), "boxes_3d": boxes, "boxes_2d": unseen}
         entries[frame.id] = entry
-    content = {"meta_info": {}, "calib": {}, "frames": list(entries.values())}
+    content = {"meta_info": {}, "calib": dict(cameras or {}), "frames": list(entries.values())}
     write_text(folder / f"{sequence}.json", json.dumps(content) + "\n")
     return len(entries)
 

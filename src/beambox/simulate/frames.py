@@ -13,6 +13,7 @@ from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.kitti import DEFAULT_IMAGE_SIZE
 from beambox.geometry.calibration import Calibration
 from beambox.simulate.annotate import annotate
+from beambox.simulate.fleets import KITTI_FLEET, Fleet
 from beambox.simulate.layouts import check_layout, pick_layout, scene
 from beambox.simulate.raycast import cast, pack
 from beambox.simulate.returns import measure
@@ -54,6 +55,7 @@ def simulate_frame(
     view: str = "camera",
     layout: str = "random",
     layout_split: str | None = "train",
+    fleet: Fleet = KITTI_FLEET,
 ) -> Frame:
     """Simulate one sweep; the same arguments give the same frame.
 
@@ -64,6 +66,7 @@ def simulate_frame(
         view: ``camera`` casts and keeps only what the camera sees; ``full`` the whole turn.
         layout: ``random``, ``kitti:PATH`` (folder or archive of label_2 and calib) or ``mixed:PATH`` (in turn).
         layout_split: which ImageSets list of the layouts to draw from, where there is one; None draws from all.
+        fleet: which objects random streets hold, and how labels call them.
 
     Returns:
         Frame with points, labels (with attributes), calibration and image size.
@@ -80,12 +83,12 @@ def simulate_frame(
     full = view == "full"
     real = pick_layout(path, layout_split, rng) if kind == "kitti" or (kind == "mixed" and index % 2) else None
     calibration = real.calibration if real else CAMERA
-    stage = scene(rng, sensor.height, full, real)
+    stage = scene(rng, sensor.height, full, real, fleet)
     points, alone, got = _sweep(stage, sensor, full, rng)
     frame = Frame(
         points=torch.from_numpy(points),
         id=f"{index:06d}",
-        labels=annotate(stage.placed, alone, got, calibration, DEFAULT_IMAGE_SIZE, full),
+        labels=fleet.rename(annotate(stage.placed, alone, got, calibration, DEFAULT_IMAGE_SIZE, full)),
         calibration=calibration,
         image_size=DEFAULT_IMAGE_SIZE,
         notes=(f"layout {real.id if real else 'random'}",),

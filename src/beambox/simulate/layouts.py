@@ -13,9 +13,10 @@ import numpy as np
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.kitti import parse_calibration, parse_labels
 from beambox.geometry.calibration import Calibration
+from beambox.simulate.fleets import KITTI_FLEET, SIZES, Fleet
 from beambox.simulate.ground import Ground, Road
 from beambox.simulate.materials import Palette
-from beambox.simulate.stage import SIZES, Stage
+from beambox.simulate.stage import Stage
 from beambox.simulate.streets import dress, random_ground, random_street
 from beambox.structures.labels import Labels
 
@@ -114,7 +115,9 @@ def pick_layout(path: str, split: str | None, rng: np.random.Generator) -> Kitti
     return KittiLayout(name, parse_labels(labels, parsed, f"{path}: label_2/{name}.txt"), parsed)
 
 
-def scene(rng: np.random.Generator, height: float, full: bool, layout: KittiLayout | None) -> Stage:
+def scene(
+    rng: np.random.Generator, height: float, full: bool, layout: KittiLayout | None, fleet: Fleet = KITTI_FLEET
+) -> Stage:
     """Build a scene: a random street, or the objects of a KITTI frame amid made-up scenery.
 
     Args:
@@ -122,12 +125,13 @@ def scene(rng: np.random.Generator, height: float, full: bool, layout: KittiLayo
         height: of the sensor, metres.
         full: whether things stand behind the sensor too.
         layout: the objects; None for a random street.
+        fleet: which objects a random street holds.
     """
     palette = Palette(rng)
     ahead = -_BEHIND if full else 0.0
     if layout is None:
         roads = _random_roads(rng)
-        stage = Stage(random_ground(roads, rng, height), palette, rng, ahead)
+        stage = Stage(random_ground(roads, rng, height), palette, rng, ahead, fleet=fleet)
         random_street(stage, roads)
         return stage
     boxes = layout.labels.boxes.numpy().astype(np.float64)

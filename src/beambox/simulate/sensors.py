@@ -76,10 +76,20 @@ _HDL64_LOWER = (
     -22.439, -22.856, -23.322, -23.971, -24.507, -25.000,
 )  # fmt: skip
 
-_HESAI_TOP, _HESAI_BOTTOM = (
-    (15.0, 11.0, 8.0, 5.0, 3.0),
-    (-7.0, -8.0, -9.0, -10.0, -11.0, -12.0, -13.0, -14.0, -19.0, -25.0),
-)
+# Design values, degrees. Pandar40: the manual's appendix on channels (15.00, 11.00, 8.00, 5.00, 3.00, 2.00, 1.67, ...),
+# the same as in Hesai's own driver HesaiLidar_General_SDK for units without a calibration file; a third of a degree
+# from +2 to -6. Pandar64: that driver's table; about a sixth of a degree from +2 to -6.
+_PANDAR40 = (
+    15.0, 11.0, 8.0, 5.0, 3.0, *(round(2 - i / 3, 3) for i in range(25)),
+    -7.0, -8.0, -9.0, -10.0, -11.0, -12.0, -13.0, -14.0, -19.0, -25.0,
+)  # fmt: skip
+_PANDAR64 = (
+    14.882, 11.032, 8.059, 5.057, 3.040, 2.028, 1.860, 1.688, 1.522, 1.351, 1.184, 1.013, 0.846, 0.675, 0.508, 0.337,
+    0.169, 0.000, -0.169, -0.337, -0.508, -0.675, -0.845, -1.013, -1.184, -1.351, -1.522, -1.688, -1.860, -2.028,
+    -2.198, -2.365, -2.536, -2.700, -2.873, -3.040, -3.210, -3.375, -3.548, -3.712, -3.884, -4.050, -4.221, -4.385,
+    -4.558, -4.720, -4.892, -5.057, -5.229, -5.391, -5.565, -5.726, -5.898, -6.061, -7.063, -8.059, -9.060, -9.885,
+    -11.032, -12.006, -12.974, -13.930, -18.889, -24.897,
+)  # fmt: skip
 
 SENSORS: dict[str, Sensor] = {
     "hdl64": Sensor(
@@ -90,28 +100,28 @@ SENSORS: dict[str, Sensor] = {
         height=1.73,
         max_range=80.0,
     ),
-    # Velodyne HDL-32E: 32 beams from +10.67 to -30.67 degrees in steps of 4/3 (manual), here on a low campus vehicle.
+    # Velodyne HDL-32E: 32 beams from +10.67 to -30.67 degrees in steps of 4/3, one of them level (application note
+    # 63-9277 on the packet structure, and the manual); here on a low campus vehicle.
     "hdl32": Sensor(
         name="hdl32",
-        elevations=tuple(round(10.67 - i * 4 / 3, 3) for i in range(32)),
+        elevations=tuple(round((32 - 4 * i) / 3, 3) for i in range(32)),
         azimuth_step=0.1667,
         height=1.2,
         max_range=80.0,
         sensitivity=0.8,
     ),
-    # Hesai Pandar40: +2 to -6 degrees in steps of 1/3, coarser beyond (manual); as on the cars of ONCE.
+    # As high as on ONCE's cars: simulated cars then stand 1.70 m below the sensor on average (ONCE's anchors: 1.71).
     "pandar40": Sensor(
         name="pandar40",
-        elevations=_HESAI_TOP + tuple(round(2 - i / 3, 3) for i in range(25)) + _HESAI_BOTTOM,
+        elevations=_PANDAR40,
         azimuth_step=0.2,
-        height=1.8,
+        height=1.75,
         max_range=120.0,
         sensitivity=1.5,
     ),
-    # Hesai Pandar64: +2 to -6 degrees in steps of 1/6 (manual).
     "pandar64": Sensor(
         name="pandar64",
-        elevations=_HESAI_TOP + tuple(round(2 - i / 6, 3) for i in range(49)) + _HESAI_BOTTOM,
+        elevations=_PANDAR64,
         azimuth_step=0.2,
         height=1.8,
         max_range=120.0,

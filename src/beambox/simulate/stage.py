@@ -8,34 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beambox.simulate import people, vehicles
+from beambox.simulate.fleets import KITTI_FLEET, Fleet, draw_size
 from beambox.simulate.ground import Ground, ground_height
 from beambox.simulate.materials import Palette
 from beambox.simulate.raycast import Placed
 from beambox.simulate.shapes import Shape
 
-__all__ = ["SIZES", "Stage", "draw_size", "overlaps"]
-
-SIZES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
-    "Car": ((3.95, 1.63, 1.53), (0.42, 0.10, 0.13)),
-    "Van": ((5.08, 1.90, 2.20), (0.70, 0.14, 0.28)),
-    "Truck": ((9.50, 2.55, 3.20), (2.20, 0.18, 0.40)),
-    "Tram": ((15.5, 2.55, 3.50), (1.50, 0.15, 0.15)),
-    "Misc": ((3.20, 1.60, 1.80), (0.90, 0.25, 0.40)),
-    "Pedestrian": ((0.84, 0.66, 1.75), (0.20, 0.11, 0.11)),
-    "Person_sitting": ((0.80, 0.60, 1.27), (0.12, 0.08, 0.06)),
-    "Cyclist": ((1.76, 0.60, 1.73), (0.16, 0.10, 0.09)),
-}
-"""Length, width, height of KITTI's classes: mean and standard deviation, metres."""
-
-
-def draw_size(name: str, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Draw (length, width, height) of a class; long cars are wide."""
-    mean, spread = SIZES[name]
-    draw = np.clip(rng.normal(size=3), -2.2, 2.2)
-    if name == "Car":
-        draw[1] = 0.5 * draw[0] + 0.85 * draw[1]
-    size = [max(m + s * d, 0.55 * m) for m, s, d in zip(mean, spread, draw)]
-    return size[0], size[1], size[2]
+__all__ = ["Stage", "overlaps"]
 
 
 def overlaps(rectangle: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -62,6 +41,7 @@ _BUILDERS = {
     "Car": vehicles.car,
     "Van": vehicles.van,
     "Truck": vehicles.truck,
+    "Bus": vehicles.bus,
     "Tram": vehicles.tram,
     "Misc": vehicles.trailer,
     "Pedestrian": people.pedestrian,
@@ -84,6 +64,8 @@ class Stage:
     """How far behind the sensor things are put, as a negative x in metres; 0 for the camera's view."""
     guard: bool = False
     """Whether scenery must not hide objects."""
+    fleet: Fleet = KITTI_FLEET
+    """Which objects there are."""
     placed: list[Placed] = field(default_factory=list)
     """Everything so far."""
 
@@ -111,10 +93,10 @@ class Stage:
         self, name: str, x: float, y: float, yaw: float, size: tuple[float, float, float] | None = None,
         bottom: float | None = None, force: bool = False,
     ) -> bool:  # fmt: skip
-        """Put an object of a class where nothing stands; returns whether it fitted.
+        """Put an object of a kind where nothing stands; returns whether it fitted.
 
         Args:
-            name: a key of :data:`SIZES`.
+            name: a kind, a key of the fleet's ``sizes``.
             x: metres.
             y: metres.
             yaw: heading, radians.
@@ -122,7 +104,7 @@ class Stage:
             bottom: z of the label's bottom; where absent the object stands on the ground.
             force: put it even where it overlaps another.
         """
-        size = size or draw_size(name, self.rng)
+        size = size or draw_size(name, self.rng, self.fleet.sizes)
         if not force and not (self.sees(x, y) and self.free(x, y, size[0], size[1], yaw)):
             return False
         z, along, across = self.ground.tilt(self.packed_ground, x, y, yaw, size[0], size[1])

@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from beambox.simulate import scenery
+from beambox.simulate.fleets import draw_size
 from beambox.simulate.ground import Ground, Road
-from beambox.simulate.stage import Stage, draw_size
+from beambox.simulate.stage import Stage
 
 __all__ = ["dress", "random_ground", "random_street"]
 
@@ -61,8 +62,8 @@ def _parked(stage: Stage, line: _Line, side: float, fill: float, across: bool) -
     u = stage.ahead + rng.uniform(-4, 6)
     inset = rng.uniform(0.1, 0.5) if rng.random() < 0.75 else -rng.uniform(0.2, 1.2)
     while u < _REACH:
-        name = rng.choice(["Car", "Car", "Car", "Car", "Car", "Car", "Car", "Car", "Car", "Van", "Misc"])
-        size = draw_size(str(name), rng)
+        name = str(rng.choice(stage.fleet.parked))
+        size = draw_size(name, rng, stage.fleet.sizes)
         along = size[1] if across else size[0]
         u += along / 2
         if rng.random() < fill:
@@ -70,19 +71,20 @@ def _parked(stage: Stage, line: _Line, side: float, fill: float, across: bool) -
             x, y, direction = line.at(u, side * (road.half_width + depth))
             turn = math.pi / 2 * side if across else (0.0 if side < 0 else math.pi)
             turn += math.pi if rng.random() < (0.4 if across else 0.1) else 0.0
-            stage.add_object(str(name), x, y, direction + turn + rng.normal(0, 0.03), size)
+            stage.add_object(name, x, y, direction + turn + rng.normal(0, 0.03), size)
         u += along / 2 + rng.exponential(0.7 if not across else 0.3) + 0.4
 
 
 def _traffic(stage: Stage, line: _Line, density: float) -> None:
     rng, road = stage.rng, line.road
+    kinds, shares = list(stage.fleet.traffic), list(stage.fleet.traffic.values())
     lanes = max(1, int(road.half_width / 3.0))
     for side in (1.0, -1.0):
         for lane in range(lanes):
             u = stage.ahead + rng.uniform(0, 25)
             while u < _REACH:
                 if rng.random() < density:
-                    name = str(rng.choice(["Car", "Van", "Truck", "Cyclist", "Tram"], p=[0.82, 0.07, 0.04, 0.06, 0.01]))
+                    name = str(rng.choice(kinds, p=shares))
                     s = side * (lane + 0.5) * min(3.3, road.half_width / lanes)
                     x, y, direction = line.at(u, s + rng.normal(0, 0.3))
                     turn = 0.0 if side < 0 else math.pi
@@ -96,13 +98,13 @@ def _people(stage: Stage, line: _Line, count: int) -> None:
         side = 1.0 if rng.random() < 0.5 else -1.0
         u = rng.uniform(4, 50) if stage.ahead == 0 or rng.random() < 0.6 else rng.uniform(stage.ahead / 2, 4)
         kind = rng.random()
-        if kind < 0.68:
+        if kind < stage.fleet.walking:
             s = side * (road.half_width + rng.uniform(-1.0, max(road.pavement, 1.0)))
             x, y, direction = line.at(u, s)
             turn = direction + (0.0 if rng.random() < 0.5 else math.pi) + rng.normal(0, 0.5)
             for k in range(rng.integers(1, 4)):
                 stage.add_object("Pedestrian", x + 0.1 * k, y + 0.75 * k, turn + rng.normal(0, 0.2))
-        elif kind < 0.95:
+        elif kind < stage.fleet.riding:
             x, y, direction = line.at(u, side * (road.half_width + rng.uniform(-2.0, 1.5)))
             stage.add_object("Cyclist", x, y, direction + (0.0 if side < 0 else math.pi) + rng.normal(0, 0.15))
         else:
@@ -122,11 +124,11 @@ def random_street(stage: Stage, roads: tuple[Road, ...]) -> None:
             if kind < 0.62:
                 _parked(stage, line, side, rng.uniform(0.15, 1.0), across=rng.random() < 0.22)
         if rng.random() < 0.65:
-            _people(stage, line, int(rng.integers(1, 8)))
+            _people(stage, line, int(rng.integers(*stage.fleet.people)))
     for _ in range(rng.integers(0, 6)):  # drives, yards, crossings: any heading
         x, y = rng.uniform(8, 60), rng.uniform(-25, 25)
         x = -x if stage.ahead < 0 and rng.random() < 0.5 else x
-        name = str(rng.choice(["Car", "Car", "Car", "Van", "Truck", "Misc"]))
+        name = str(rng.choice(stage.fleet.strays))
         stage.add_object(name, x, y, rng.uniform(-math.pi, math.pi))
     for road in roads:
         dress(stage, road)

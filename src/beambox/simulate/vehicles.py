@@ -1,4 +1,4 @@
-"""Bodies of cars, vans, trucks and trams: profiles, rounded ends, tumblehome, windows, seats, wheels, plates and lamps.
+"""Bodies of cars, vans, trucks, buses and trams: profiles, rounded ends, tumblehome, windows, wheels, lamps.
 
 Every builder fills a box of the given length, width and height; mirrors stick out, as they do of KITTI's boxes.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from beambox.simulate.materials import AIR, DARK, GLASS, LIGHT, PANE, RETRO, RIM, TYRE, Palette
 from beambox.simulate.shapes import Plane, Shape, profile_planes
 
-__all__ = ["CAR_STYLES", "car", "trailer", "tram", "truck", "van"]
+__all__ = ["CAR_STYLES", "bus", "car", "trailer", "tram", "truck", "van"]
 
 
 @dataclass(frozen=True)
@@ -274,8 +274,39 @@ def truck(size: tuple[float, float, float], palette: Palette, rng: np.random.Gen
     return shape
 
 
+def bus(size: tuple[float, float, float], palette: Palette, rng: np.random.Generator) -> Shape:
+    """A city bus or coach: a long box on wheels, glass in front, a band of windows, doors on the right."""
+    length, width, h = size
+    shape, paint = Shape(), palette.paint()
+    hx, hy = length / 2, width / 2
+    clear, belt = rng.uniform(0.22, 0.34), rng.uniform(0.32, 0.45) * h
+    slant = rng.uniform(0.05, 0.35)
+    outline = _hull([
+        (-hx, clear), (hx * 0.99, clear), (hx, 0.3 * h), (hx - slant, 0.95 * h), (hx - slant - 0.15, h),
+        (-hx + 0.12, h), (-hx, 0.95 * h),
+    ])  # fmt: skip
+    ends = _plan_planes(hx, hy, (0.3, 0.15), (0.06, 0.02), paint)
+    flat: list[Plane] = [(0.0, 1.0, 0.0, hy, paint), (0.0, -1.0, 0.0, hy, paint)]
+    flat += _side(hy, 0.8 * h, hy * 0.97, h, paint)
+    shape.convex(profile_planes(outline, [paint] * len(outline)) + flat + ends, (-hx, -hy, clear), (hx, hy, h))
+    top = rng.uniform(0.78, 0.88) * h
+    shape.patch((hx - slant - 0.3, -hy * 0.9, belt * 0.9), (hx * 1.01, hy * 0.9, top), PANE)
+    for side in (1.0, -1.0):
+        y0, y1 = sorted((side * hy * 1.01, side * hy * 0.9))
+        shape.patch((-hx * 0.95, y0, belt), (hx - 0.6, y1, top), PANE)
+        shape.ellipsoid((hx - 0.15, side * (hy + 0.12), 0.6 * h), (0.09, 0.13, 0.2), DARK)
+    for x in (hx * 0.8, -0.05 * hx):
+        shape.patch((x - 0.6, -hy * 1.01, clear), (x + 0.6, -hy * 0.9, top), PANE)
+    if rng.random() < 0.7:
+        shape.patch((-hx * 1.01, -hy * 0.8, belt), (-hx + 0.2, hy * 0.8, top), PANE)
+    shape.box((-hx * 0.9, -hy * 0.85, 0.15), (hx * 0.9, hy * 0.85, clear), DARK)
+    _wheels(shape, (hx - min(2.6, 0.28 * length), -hx + min(3.2, 0.3 * length)), hy, 0.48, 0.3)
+    _lamps(shape, hx, hy, 1.9, rng, 1.0)
+    return shape
+
+
 def tram(size: tuple[float, float, float], palette: Palette, rng: np.random.Generator) -> Shape:
-    """A tram or bus: a long box with a band of windows."""
+    """A tram: a long box with a band of windows."""
     length, width, h = size
     shape, paint = Shape(), palette.paint()
     hx, hy = length / 2, width / 2
