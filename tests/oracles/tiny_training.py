@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from beambox.data.loader import MixedSource
+from beambox.data.mixture import MixedSource
 from beambox.data.source import FrameList
 from beambox.detectors.catalogue import build
 from beambox.structures import Frame, Labels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beambox.data.loader import MixedSource
+from beambox.checks import BeamboxError
+from beambox.data.database import ObjectDatabase
+from beambox.data.mixture import MixedSource
+from beambox.data.source import FrameList
 from beambox.geometry.grid import VoxelGrid
 from beambox.structures import Labels
-from beambox.train.feed import choose_window, stream
-from oracles.tiny_training import frames, tiny_run
+from beambox.train.config import AugmentSection
+from beambox.train.feed import Feed, TrainingBatch, choose_window, stream
+from beambox.train.sources import Change
+from oracles.scenes import scene
+from oracles.tiny_training import frames, shuffled, tiny_run
 
 GRID = VoxelGrid((0.0, -12.8, -3.0), (25.6, 12.8, 1.0), (0.16, 0.16, 4.0))
 
@@ -69,10 +76,38 @@ def test_a_frame_without_objects_is_replaced(tmp_path: Path) -> None:
     feed.source = MixedSource([source])
     names = {feed.frame(position).id for position in range(9)}
     assert "empty" not in names
+    feed.source = MixedSource([FrameList([empty])])
+    assert feed.frame(0).id == "empty", "where there is no other, it stays"
+
+
+def sampling_feed(**changes: Any) -> Feed:
+    """Batches with everything that draws: a mixture, sampled objects, augmentation, windows."""
+    near, far = (FrameList([scene(first + k, ground=50) for k in range(4)]) for first in (0, 50))
+    augmentation = AugmentSection(sample={"Car": 3}, rotation=0.5, flip_x=0.5)
+    change = Change(augmentation, ObjectDatabase.build(near, ["Car"]), seed=5)
+    grid = VoxelGrid((0.0, -25.6, -3.0), (51.2, 25.6, 1.0), (0.4, 0.4, 4.0))
+    options: dict[str, Any] = {"batch": 2, "window": (64, 64), "seed": 5, **changes}
+    return Feed(MixedSource([near, far], [1, 3]), change, ("Car",), grid, **options)
+
+
+def same(one: TrainingBatch, other: TrainingBatch) -> bool:
+    assert one.batch.labels is not None and other.batch.labels is not None
+    boxes = all(torch.equal(a.boxes, b.boxes) for a, b in zip(one.batch.labels, other.batch.labels, strict=True))
+    points = torch.equal(one.batch.points, other.batch.points)
+    return one.batch.frame_ids == other.batch.frame_ids and one.grid == other.grid and points and boxes
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_stream_yields_the_steps_asked_for(tmp_path: Path, workers: int) -> None:
-    feed = tiny_run(tmp_path).feed
-    got = [work.batch.frame_ids for work in stream(feed, 2, 5, workers)]
-    assert got == [feed[step].batch.frame_ids for step in (2, 3, 4)]
+def test_a_stream_continues_as_if_it_had_not_stopped(workers: int) -> None:
+    whole = list(stream(sampling_feed(), 0, 9, 0))
+    rest = list(stream(sampling_feed(), 3, 9, workers))
+    assert [same(a, b) for a, b in zip(whole[3:], rest, strict=True)] == [True] * 6
+    assert not same(whole[3], sampling_feed(seed=6)[3])
+    assert not same(whole[3], whole[7]), "the second epoch has an order of its own"
+
+
+def test_what_cannot_be_shared_or_drawn_is_said() -> None:
+    with pytest.raises(BeamboxError, match="batch = 2 frames cannot be shared evenly by 3 processes"):
+        sampling_feed(world=3)
+    with pytest.raises(BeamboxError, match="there are no training frames"):
+        Feed(MixedSource([FrameList([])]), shuffled, ("Car",), GRID, 2)

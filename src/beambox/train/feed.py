@@ -10,13 +10,13 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from beambox.checks import BeamboxError
-from beambox.data.loader import MixedSource
+from beambox.data.mixture import MixedSource
 from beambox.geometry.grid import VoxelGrid
 from beambox.structures import Batch, Frame, Labels
 
 __all__ = ["Feed", "TrainingBatch", "choose_window", "stream"]
 
-# what a random stream is for; keeps the streams of one seed apart, and apart from those of beambox.data.loader
+# what a random stream is for; keeps the streams of one seed apart, and apart from those of beambox.data
 CHANGES, WINDOW = 11, 12
 ATTEMPTS = 8
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from beambox import __version__
 from beambox.checks import BeamboxError
 from beambox.data.database import ObjectDatabase
-from beambox.data.loader import MixedSource
+from beambox.data.mixture import MixedSource
 from beambox.detectors.catalogue import build, config_to_dict, name_of
 from beambox.detectors.weights import fill, read_weights, save_weights
 from beambox.train.checkpoint import (
