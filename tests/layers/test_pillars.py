@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from beambox.geometry.grid import VoxelGrid
@@ -50,3 +51,21 @@ def test_without_absolute_position_a_shift_by_whole_cells_changes_nothing() -> N
     first = network(voxelize(points, sample, 1, GRID))
     second = network(voxelize(moved, sample, 1, GRID))
     torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("absolute_xy", [True, False])
+def test_far_pillars_look_the_same_in_mixed_precision(absolute_xy: bool) -> None:
+    torch.manual_seed(0)
+    network = PillarFeatures(16, absolute_xy=absolute_xy).eval()
+    grid = VoxelGrid((64, -4, -3), (72, 4, 1), (0.16, 0.16, 4))
+    points = cloud(200) * torch.tensor([0.5, 0.5, 0.5, 1]) + torch.tensor([68.0, 2.0, 0.0, 0.0])
+    voxels = voxelize(points, torch.zeros(200, dtype=torch.int64), 1, grid)
+    seen: list[torch.Tensor] = []
+    network.linear.register_forward_hook(lambda _, inputs, out: seen.append(out.detach()))
+    network(voxels)
+    network.norm.running_mean, network.norm.running_var = seen[0].mean(dim=0), seen[0].var(dim=0)  # as trained here
+    exact = network(voxels)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = network(voxels)
+    error = (mixed - exact).norm() / exact.norm()
+    assert float(error.detach()) < 0.01

@@ -93,7 +93,9 @@ class VoxelEncoder(nn.Module):
 
     def forward(self, voxels: SparseTensor) -> EncoderStages:
         """Encode ``(V, in_channels)`` voxel features."""
-        stride1 = self.stage1(self.stem(voxels))
+        with torch.autocast(voxels.features.device.type, enabled=False):  # metres: bfloat16 would round them to 0.5
+            stem = self.stem(voxels)
+        stride1 = self.stage1(stem)
         stride2 = self.stage2(stride1)
         stride4 = self.stage3(stride2)
         stride8 = self.stage4(stride4)

@@ -40,7 +40,7 @@ class PillarFeatures(nn.Module):
         centre = voxels.grid.centre(voxels.index[:, 1:]).to(xyz.dtype)  # (V, 3)
         absolute = voxels.points if self.absolute_xy else voxels.points[:, 2:]
         described = torch.cat((absolute, xyz - mean[voxels.voxel], xyz - centre[voxels.voxel]), dim=1)
-        lifted = self.linear(described)  # (K, channels)
+        lifted = self.lift(described)  # (K, channels)
         if len(lifted) < 2 and self.training:  # batch statistics need two values
             lifted = functional.batch_norm(
                 lifted, self.norm.running_mean, self.norm.running_var, self.norm.weight, self.norm.bias, eps=1e-3
@@ -60,3 +60,10 @@ class PillarFeatures(nn.Module):
         )  # (1, channels): what an empty place gives
         padded = torch.maximum(features, functional.relu(of_zero))
         return torch.where((voxels.count < self.empty_slots)[:, None], padded, features)
+
+    def lift(self, described: Tensor) -> Tensor:
+        """Apply the linear layer, in float32 where it sees metres: at 70 m, bfloat16 knows only every half metre."""
+        if not self.absolute_xy:
+            return self.linear(described)
+        with torch.autocast(described.device.type, enabled=False):
+            return self.linear(described)
