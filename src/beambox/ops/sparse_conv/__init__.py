@@ -30,7 +30,7 @@ __all__ = [
 def _can_run_numba(*tensors: Tensor) -> str | None:
     """Return why the CPU version cannot run; unlike other operations it takes half precision too."""
     half = (torch.bfloat16, torch.float16)
-    return can_run_numba(*(t.float() if t.dtype in half and t.device.type == "cpu" else t for t in tensors))
+    return can_run_numba(*(t for t in tensors if t.dtype not in half or t.device.type != "cpu"))
 
 
 def _can_run_triton(*tensors: Tensor) -> str | None:
