@@ -16,8 +16,7 @@ from typing import Any
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
 from beambox.detectors.weights import load_weights, write_atomically
-from beambox.infer.evaluate import Detect, detect_frames, network, score_frames, scored_frames
-from beambox.metrics import once
+from beambox.infer.evaluate import Detect, detect_frames, network, score_frames, score_once, scored_frames
 from beambox.structures import Detections, Frame
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.loop import FINAL, LAST, train
@@ -155,7 +154,7 @@ def score(model: Any, source: FrameSource, recipe: Recipe) -> dict[str, Any]:
     frames = scored_frames(detect_frames(timed, source))
     section = recipe.validation
     if section.source.kind == "once":
-        result = once.evaluate([(frame.labels, frame.detections) for frame in frames])
+        result = score_once(frames, section.iou or None)
     else:
         result = score_frames(frames, model.config.classes, section.iou or None, section.level != "all")
     return {**result.to_json(), "time": {"ms": timed.median()}}

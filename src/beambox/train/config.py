@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.augment import AugmentConfig
+from beambox.metrics.once import SUPERCLASSES
 
 __all__ = [
     "AugmentSection",
@@ -123,22 +124,42 @@ class EmaSection(Section):
 
 
 class ValidationSection(Section):
-    """Scoring during the run, with KITTI's metric."""
+    """Scoring during the run: by ONCE's metric where the source is of ``kind: once``, else by KITTI's."""
 
     source: SourceSection
     """Frames to score on."""
     every: int = Field(default=1000, gt=0)
     """Iterations between two validations; one more follows the last iteration."""
     choose_by: str = "mean"
-    """Class whose average precision decides which weights are the best, or ``mean`` over the classes."""
+    """Class whose average precision decides which weights are the best, or ``mean`` over the classes; for ONCE
+    Vehicle, Pedestrian, Cyclist or ``mean``, at all distances together."""
     view: Literal["3d", "bev"] = "3d"
-    """Overlap in space or from above."""
+    """KITTI: overlap in space or from above."""
     recalls: Literal["R40", "R11", "all"] = "R40"
-    """Recall positions of the average precision; ``all`` suits sets with few objects."""
+    """KITTI: recall positions of the average precision; ``all`` suits sets with few objects."""
     level: Literal["easy", "moderate", "hard", "all"] = "moderate"
     """KITTI's difficulty; ``all``: every object counts, as in data without a camera."""
     iou: dict[str, float] = {}
-    """Overlap that counts as found, by class, where it differs from KITTI's."""
+    """Overlap that counts as found, by class, where it differs from the metric's own."""
+
+    @model_validator(mode="after")
+    def _fits_the_metric(self) -> ValidationSection:
+        if self.source.kind != "once":
+            return self
+        defaults = {"view": self.view == "3d", "recalls": self.recalls == "R40", "level": self.level == "moderate"}
+        for key, kept in defaults.items():
+            if not kept:
+                raise ValueError(
+                    f"`{key}` is of KITTI's metric, and a source of kind once is scored by ONCE's; drop it"
+                )
+        for key, name in (*(("iou", name) for name in self.iou), ("choose_by", self.choose_by)):
+            known = list(SUPERCLASSES) if key == "iou" else [*SUPERCLASSES, "mean"]
+            if name not in known:
+                raise ValueError(
+                    f"`{key}`: ONCE's metric has no class {name!r}{did_you_mean(name, known)}; "
+                    "it merges Car, Bus and Truck into Vehicle"
+                )
+        return self
 
 
 class Recipe(Section):

@@ -1,4 +1,4 @@
-"""Scoring during a run: KITTI's metric on the validation source, and the one number that chooses the best weights."""
+"""Scoring during a run: KITTI's or ONCE's metric on the validation source, and the number that chooses the weights."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.source import FrameSource
-from beambox.infer.evaluate import detect_frames, network, score_frames, scored_frames
+from beambox.infer.evaluate import detect_frames, network, score_frames, score_once, scored_frames
 from beambox.metrics.kitti_result import KittiResult
+from beambox.metrics.once_result import OnceResult
 from beambox.train.config import ValidationSection
 
-__all__ = ["Score", "Validator", "summarise"]
+__all__ = ["Score", "Validator", "summarise", "summarise_once"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,9 @@ class Validator:
 
     def __call__(self, model: Any) -> Score:
         """Score a detector; its training mode is restored."""
+        if self.section.source.kind == "once":
+            frames = scored_frames(detect_frames(network(model), self.source))
+            return summarise_once(score_once(frames, self.section.iou or None), self.section)
         classes = model.config.classes
         if self.section.choose_by != "mean" and self.section.choose_by not in classes:
             raise BeamboxError(
@@ -64,3 +68,11 @@ def summarise(result: KittiResult, section: ValidationSection) -> Score:
     protocol = f"{section.view} {section.recalls} {result.levels[level]}"
     logged = {name: v for name, v in {**scalars, "mean": mean}.items() if not math.isnan(v)}
     return Score(value, f"{protocol} {told}, mean {mean:.2f}", logged, result.to_json())
+
+
+def summarise_once(result: OnceResult, section: ValidationSection) -> Score:
+    """Pick the recipe's number out of a result by ONCE's rules: the column ``overall`` of a class, or its mean."""
+    scalars = {name: row[0] for name, row in zip(result.classes, result.ap)}
+    scalars["mean"] = result.mean()[0]
+    told = ", ".join(f"{name} {value:.2f}" for name, value in scalars.items())
+    return Score(scalars[section.choose_by], f"ONCE AP overall {told}", scalars, result.to_json())
