@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
-from beambox.detectors.catalogue import CATALOGUE
-from beambox.structures import Batch
-from oracles.small_detectors import CAR, SMALL, car_frame, first_stage, made, total
+from beambox.detectors.catalogue import CATALOGUE, build, config_to_dict
+from beambox.detectors.voxel_rcnn import VoxelRcnnPredictions
+from beambox.detectors.weights import load_weights, save_weights
+from beambox.infer.fusion import fold_batch_norms
+from beambox.layers.attention import HeightChannelFusion
+from beambox.structures import Batch, Frame, Labels
+from oracles.learning import learn_by_heart
+from oracles.small_detectors import CAR, SMALL, VARIANTS, car_frame, first_stage, made, said, total
+
+ONE_STAGE = {"cls", "loc", "direction"}
+TWO_STAGES = ONE_STAGE | {"roi_cls", "roi_box", "roi_corner"}
+LOSSES = {
+    "dennet": TWO_STAGES,
+    "hcnet": ONE_STAGE,
+    "kassd": ONE_STAGE | {"keypoints"},
+    "pointpillars": ONE_STAGE,
+    "second": ONE_STAGE,
+    "voxel_rcnn": TWO_STAGES,
+}
+CELLS = {"dennet": 64, "hcnet": 1024, "kassd": 256, "pointpillars": 1024, "second": 256, "voxel_rcnn": 256}
+"""Of the small ones' maps."""
 
 
 def test_every_detector_has_a_small_one() -> None:
@@ -30,7 +49,12 @@ def count(module: nn.Module) -> int:
     return sum(layer.weight.numel() for layer in layers)
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+LONG_TO_COMPILE = ("hcnet", "kassd")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG_TO_COMPILE else ()) for name in CATALOGUE]
+)
 def test_a_compiled_detector_says_and_learns_the_same(name: str) -> None:
     torch.compiler.reset()
     plain, compiled = made(name).eval(), made(name).eval()
@@ -54,4 +78,110 @@ def test_a_compiled_detector_says_and_learns_the_same(name: str) -> None:
     assert len(runs) == len(compiled.dense), "each layer is one graph without a break, and none is passed over"
     for key, gradient in gradients[0].items():
         torch.testing.assert_close(gradients[1][key], gradient, msg=lambda text, key=key: f"{key}: {text}")
-    torch.testing.assert_close(first_stage(compiled(batch)).cls, first_stage(plain(batch)).cls)
+    torch.testing.assert_close(said(compiled(batch)), said(plain(batch)))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_losses_reach_every_parameter(variant: str) -> None:
+    name = variant.split(":", maxsplit=1)[0]
+    config = VARIANTS[variant]
+    model = made(name, config)
+    for layer in model.modules():
+        if isinstance(layer, HeightChannelFusion):
+            for key, parameter in layer.named_parameters():
+                if key.endswith("bias"):
+                    nn.init.constant_(parameter, 0.5)  # so that no ReLU of the attention is shut from the start
+    batch = Batch.of([car_frame(5, CAR), car_frame(6)])
+    predictions = model(batch)
+    if isinstance(predictions, VoxelRcnnPredictions):
+        predictions.rois.boxes[::2] = torch.tensor(CAR)  # as if some proposals had found the car, to be refined
+    first = first_stage(predictions)
+    assert len(first.anchors) == CELLS[name] * 2 * len(config.classes)
+    assert first.cls.shape == (2, len(first.anchors), len(config.classes))
+    losses = model.loss(predictions, batch.labels)
+    assert set(losses) == LOSSES[name] - (set() if getattr(config, "kam", True) else {"keypoints"})
+    total(losses).backward()
+    gradients = {key: parameter.grad for key, parameter in model.named_parameters()}
+    assert [key for key, grad in gradients.items() if grad is None or not bool(grad.isfinite().all())] == []
+    assert [key for key, grad in gradients.items() if not bool(grad.any())] == []
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_samples_of_a_batch_do_not_touch_each_other(name: str) -> None:
+    model = made(name).eval()
+    one, two = car_frame(3, CAR), car_frame(4, CAR)
+    with torch.inference_mode():
+        alone, joined = said(model(Batch.of([two]))), said(model(Batch.of([one, two])))
+    torch.testing.assert_close([part[1:] for part in joined], alone, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_sweeps_without_points_give_predictions_a_loss_and_no_error(name: str, training: bool, count: int) -> None:
+    model = made(name).train(training)
+    empty = Frame(torch.zeros(0, 4), labels=Labels.empty())
+    predictions = model(Batch.of([empty] * count))
+    assert bool(first_stage(predictions).cls.isfinite().all())
+    assert len(model.decode(predictions)) == count
+    losses = model.loss(predictions, [Labels.empty()] * count)
+    assert all(bool(loss.isfinite()) for loss in losses.values())
+    total(losses).backward()
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_another_region_of_the_same_cells(name: str) -> None:
+    model = made(name).eval()
+    window = SMALL[name].grid.window((8, 8), (40, 24))
+    batch = Batch.of([car_frame(1, CAR)])
+    with torch.inference_mode():
+        whole, part = first_stage(model(batch)), first_stage(model(batch, window))
+    ny, nx = SMALL[name].grid.shape[1:]
+    assert part.grid == window
+    assert part.cls.shape[1] == len(part.anchors) == len(whole.anchors) * (40 * 24) // (ny * nx)
+    assert not torch.equal(part.anchors[0], whole.anchors[0])
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_is_built_by_name_and_survives_a_weight_file(variant: str, tmp_path: Path) -> None:
+    model = build(variant.split(":", maxsplit=1)[0], config_to_dict(VARIANTS[variant]))
+    assert model.config == VARIANTS[variant]
+    save_weights(tmp_path / "w.safetensors", model)
+    again = load_weights(tmp_path / "w.safetensors")
+    assert type(again) is type(model) and again.config == model.config
+    batch = Batch.of([car_frame(1, CAR)])
+    with torch.inference_mode():
+        torch.testing.assert_close(said(again(batch)), said(model.eval()(batch)))
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_folded_batch_norms_predict_the_same(name: str) -> None:
+    model = made(name)
+    batch = Batch.of([car_frame(1, CAR)])
+    with torch.inference_mode():
+        for layer in model.modules():
+            if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
+                layer.momentum = 1.0  # one pass in training mode makes the statistics those of the sweep
+                nn.init.uniform_(layer.weight, 0.5, 1.5)
+                nn.init.normal_(layer.bias, 0, 0.2)
+        model.train()(batch)
+        folded = fold_batch_norms(model.eval())
+        plain, changed = said(model(batch)), said(folded(batch))
+    assert float(plain[0].std()) > 0.01, "a network that says the same everywhere would prove nothing"
+    torch.testing.assert_close(changed, plain, rtol=0, atol=2e-5)
+    assert not any(isinstance(layer, nn.BatchNorm2d) for part in folded.dense for layer in part.modules())
+
+
+@pytest.mark.parametrize("name", ["pointpillars", "hcnet"])
+def test_overfits_two_cars_and_finds_them(name: str) -> None:
+    model = made(name)
+    cars = [6, 2, -1, 4.0, 1.7, 1.5, 0.4], [13, -4, -1, 3.7, 1.6, 1.5, -2.0]
+    frame = car_frame(1, *cars, ground=1500, reach=20.0)
+    losses = learn_by_heart(model, frame, 80, 0.01)
+    assert losses[-1] < 0.1 * losses[0]
+    (found,) = model.decode(model(Batch.of([frame])))
+    best = found[:2].boxes.detach()
+    best = best[best[:, 0].argsort()]
+    labelled = torch.tensor(cars)
+    torch.testing.assert_close(best[:, :2], labelled[:, :2], atol=0.3, rtol=0)
+    assert bool((torch.cos(best[:, 6] - labelled[:, 6]) > 0.9).all())

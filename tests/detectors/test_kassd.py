@@ -5,67 +5,21 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.data.kitti import KittiSource
 from beambox.detectors.catalogue import build, config_to_dict
 from beambox.detectors.kassd import KamOptions, KamScore, Kassd, KassdConfig, KassdPredictions, Neck, kassd
 from beambox.detectors.second import KITTI_CAR, second
-from beambox.detectors.weights import load_weights, save_weights
-from beambox.geometry.boxes import wrap_angle
 from beambox.geometry.grid import VoxelGrid
-from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.layers.heads import LossWeights
 from beambox.layers.keypoints import ExtraPoint, KeypointLayout
 from beambox.layers.location_attention import LamReduce
-from beambox.structures import Batch, Frame, Labels
-from oracles.paths import data_dir
-
-SMALL = KassdConfig(
-    grid=VoxelGrid((0.0, -6.4, -3.0), (12.8, 6.4, 1.0), (0.1, 0.1, 0.1)),
-    encoder_widths=(4, 4, 8, 8),
-    encoder_out=8,
-    width=8,
-    kam_width=8,
-    centred_anchors=True,
-)
-CAR = [6.0, 1.0, -1.0, 4.0, 1.7, 1.5, 0.4]
-
-
-def car_frame(seed: int, *boxes: list[float]) -> Frame:
-    generator = torch.Generator().manual_seed(seed)
-    ground = torch.rand(800, 4, generator=generator) * torch.tensor([12.0, 12.0, 0.05, 0.3])
-    clouds = [ground - torch.tensor([0.0, 6.0, 1.75, 0.0])]
-    for x, y, z, length, width, height, yaw in boxes:
-        local = (torch.rand(300, 3, generator=generator) - 0.5) * torch.tensor([length, width, height])
-        face = torch.randint(0, 2, (300,), generator=generator)
-        local[face == 0, 0] = -length / 2
-        local[face == 1, 1] = -width / 2
-        turn = torch.polar(torch.ones(()), torch.tensor(yaw)) * torch.complex(local[:, 0], local[:, 1])
-        xyz = torch.stack((x + turn.real, y + turn.imag, z + local[:, 2]), dim=1)
-        clouds.append(torch.cat((xyz, torch.full((300, 1), 0.5)), dim=1))
-    labels = Labels(torch.tensor(boxes, dtype=torch.float32).reshape(-1, 7), ("Car",) * len(boxes))
-    return Frame(torch.cat(clouds), id=str(seed), labels=labels)
+from beambox.structures import Batch
+from oracles.learning import check_found, check_headings, learn_by_heart, scan_with_cars
+from oracles.small_detectors import CAR, KASSD, VARIANTS, car_frame, made
 
 
 def size_of(config: KassdConfig) -> int:
     with torch.device("meta"):
         return sum(p.numel() for p in kassd(config).parameters())
-
-
-def total(losses: dict[str, torch.Tensor]) -> torch.Tensor:
-    return torch.stack(list(losses.values())).sum()
-
-
-def overfit(model: Kassd, batch: Batch, steps: int, lr: float) -> list[float]:
-    assert batch.labels is not None
-    optimiser = torch.optim.Adam(model.train().parameters(), lr=lr)
-    losses = []
-    for _ in range(steps):
-        optimiser.zero_grad()
-        loss = total(model.loss(model(batch), batch.labels))
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    return losses
 
 
 def test_each_switch_has_the_parameters_of_its_parts() -> None:
@@ -107,11 +61,11 @@ def test_the_defaults_are_the_papers_setting() -> None:
 
 def test_swapped_weights_scale_the_losses() -> None:
     torch.manual_seed(0)
-    model = kassd(SMALL).eval()
+    model = kassd(KASSD).eval()
     batch = Batch.of([car_frame(1, CAR)])
     assert batch.labels is not None
     printed = model.loss(model(batch), batch.labels)
-    model.config = replace(SMALL, swapped=True)
+    model.config = replace(KASSD, swapped=True)
     swapped = model.loss(model(batch), batch.labels)
     assert set(printed) == {"cls", "loc", "direction", "keypoints"}
     torch.testing.assert_close(swapped["cls"], printed["cls"] / 2)
@@ -120,34 +74,19 @@ def test_swapped_weights_scale_the_losses() -> None:
         torch.testing.assert_close(swapped[name], printed[name])
 
 
-CONFIGS = {
-    "full": SMALL,
-    "baseline": replace(SMALL, llm=False, kam=False),
-    "plain-llm": replace(SMALL, frs_reuse=False, lam=False),
-    "psa-corners": replace(SMALL, neck=Neck.PSA, keypoints=KeypointLayout(2, 2, 0, 0)),
-    "denseaspp-inner": replace(SMALL, neck=Neck.DENSEASPP, keypoints=KeypointLayout(0, 0, 6, 3)),
-    "spp-centre": replace(SMALL, neck=Neck.SPP, keypoints=KeypointLayout(extra_point=ExtraPoint.CENTER)),
-    "second-soft": replace(SMALL, neck=Neck.SECOND, kam_options=KamOptions(soft_targets=True, box_gradient=True)),
-    "three-classes": replace(SMALL, anchors=KITTI_ANCHORS, kam_options=KamOptions(positive_iou=(0.7, 0.5, 0.5))),
-}
+OF_KASSD = {name: config for name, config in VARIANTS.items() if isinstance(config, KassdConfig)}
 
 
-@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
-def test_every_parameter_receives_a_gradient(config: KassdConfig) -> None:
-    torch.manual_seed(0)
-    model = kassd(config)
-    batch = Batch.of([car_frame(5, CAR), car_frame(6)])
-    assert batch.labels is not None
-    predictions = model(batch)
-    assert predictions.head.cls.shape == (2, 16 * 16 * 2 * len(config.anchors), len(config.anchors))
-    if predictions.maps is not None:
-        assert predictions.maps.shape == (2, config.keypoints.count * len(config.anchors), 16, 16)
-    total(model.loss(predictions, batch.labels)).backward()
-    # a map of a class without any box in the frames is not read: its last convolution's gradient may be zero there
-    assert [name for name, p in model.named_parameters() if p.grad is None or not bool(p.grad.any())] == []
+@pytest.mark.parametrize("config", OF_KASSD.values(), ids=OF_KASSD.keys())
+def test_there_is_a_map_for_every_keypoint_of_every_class(config: KassdConfig) -> None:
+    maps = made("kassd", config)(Batch.of([car_frame(5, CAR), car_frame(6)])).maps
+    if config.kam:
+        assert maps.shape == (2, config.keypoints.count * len(config.anchors), 16, 16)
+    else:
+        assert maps is None
 
 
-def scored_by(maps: torch.Tensor, config: KassdConfig = SMALL, codes: float = 0.0) -> tuple[Kassd, KassdPredictions]:
+def scored_by(maps: torch.Tensor, config: KassdConfig = KASSD, codes: float = 0.0) -> tuple[Kassd, KassdPredictions]:
     """A network's predictions with chosen maps and one sure anchor a quarter of the way into the map."""
     model = kassd(config).eval()
     with torch.no_grad():
@@ -167,20 +106,20 @@ def test_the_keypoints_score_replaces_the_class_score_or_multiplies_it() -> None
     (found,) = model.decode(predictions)
     assert found.scores.tolist() == pytest.approx([1 / (1 + math.exp(-1.5))])
     assert found.boxes[0].tolist() == pytest.approx([6.8, -2.8, -1.0, 3.9, 1.6, 1.56, 0.0], abs=1e-5)
-    both = replace(SMALL, kam_options=KamOptions(score=KamScore.MULTIPLY))
+    both = replace(KASSD, kam_options=KamOptions(score=KamScore.MULTIPLY))
     model, predictions = scored_by(maps, both)
     (found,) = model.decode(predictions)
     assert found.scores.tolist() == pytest.approx([1 / (1 + math.exp(-1.5)) / (1 + math.exp(-2.0))])
     model, predictions = scored_by(maps - 3.0)
     assert len(model.decode(predictions)[0]) == 0, "a box the keypoints call bad is dropped, whatever its class score"
-    model, predictions = scored_by(maps, replace(SMALL, kam=False))
+    model, predictions = scored_by(maps, replace(KASSD, kam=False))
     (found,) = model.decode(replace(predictions, maps=None))
     assert found.scores.tolist() == pytest.approx([1 / (1 + math.exp(-2.0))])
 
 
 def test_keypoints_are_read_where_the_box_is_also_in_another_region() -> None:
     torch.manual_seed(0)
-    model = kassd(replace(SMALL, frs_reuse=False)).eval()
+    model = kassd(replace(KASSD, frs_reuse=False)).eval()
     maps = torch.zeros(1, 31, 16, 16)
     model, predictions = scored_by(maps)
     rows = torch.tensor([(4 * 16 + 8) * 2])
@@ -188,7 +127,7 @@ def test_keypoints_are_read_where_the_box_is_also_in_another_region() -> None:
     place = predictions.head.anchors[rows, :2]
     maps[:, :, 4 - 3 : 4 + 4, 8 - 6 : 8 + 7] = torch.randn(1, 31, 7, 13)
     whole = model.scores(predictions, 0, boxes, torch.zeros(1, dtype=torch.int64), place)
-    window = SMALL.grid.window((8, 8), (96, 96))
+    window = KASSD.grid.window((8, 8), (96, 96))
     moved = KassdPredictions(replace(predictions.head, grid=window), maps[..., 1:13, 1:13])
     torch.testing.assert_close(model.scores(moved, 0, boxes, torch.zeros(1, dtype=torch.int64), place), whole)
 
@@ -219,7 +158,7 @@ def test_without_a_sure_anchor_the_best_ones_learn() -> None:
 def test_the_scores_loss_moves_boxes_only_if_asked() -> None:
     for asked in (False, True):
         torch.manual_seed(0)
-        model = kassd(replace(SMALL, kam_options=KamOptions(box_gradient=asked)))
+        model = kassd(replace(KASSD, kam_options=KamOptions(box_gradient=asked)))
         batch = Batch.of([car_frame(1, CAR)])
         assert batch.labels is not None
         model.loss(model(batch), batch.labels)["keypoints"].backward()
@@ -231,53 +170,34 @@ def test_the_scores_loss_moves_boxes_only_if_asked() -> None:
 
 
 def test_overfits_two_cars_and_finds_them() -> None:
-    torch.manual_seed(0)
     frame = car_frame(1, CAR, [9.5, -3.5, -1.0, 3.7, 1.6, 1.5, -2.0])
-    model = kassd(replace(SMALL, encoder_widths=(4, 8, 8, 8), width=16, kam_width=16))
-    batch = Batch.of([frame])
-    losses = overfit(model, batch, 70, 0.01)
+    model = made("kassd", replace(KASSD, encoder_widths=(4, 8, 8, 8), width=16, kam_width=16))
+    losses = learn_by_heart(model, frame, 70, 0.01)
     assert losses[-1] < 0.1 * losses[0]
-    (found,) = model.decode(model(batch))
-    assert frame.labels is not None
+    (found,) = model.decode(model(Batch.of([frame])))
     check_found(found.boxes.detach(), frame.labels.boxes)
-
-
-def check_found(found: torch.Tensor, labelled: torch.Tensor) -> None:
-    distance = torch.cdist(found[:, :2], labelled[:, :2])
-    assert float(distance.amin(dim=0).max()) < 0.5, "every labelled car is found"
-    assert float(distance.amin(dim=1).max()) < 0.5, "nothing else is found"
-    heading = wrap_angle(found[:, 6] - labelled[distance.argmin(dim=1), 6])
-    assert float(heading.abs().max()) < 0.5
+    check_headings(found.boxes.detach(), frame.labels.boxes)
 
 
 @pytest.mark.slow
 def test_overfits_a_real_scan() -> None:
-    source = KittiSource(data_dir("kitti"), "train", fov=True)
     grid = VoxelGrid((0.0, -16.0, -3.0), (32.0, 16.0, 1.0), (0.1, 0.1, 0.1))
-    frame = next(f for f in source if f.labels is not None and len(near_cars(f.labels, grid)) >= 4)
-    assert frame.labels is not None
-    labels = near_cars(frame.labels, grid)
-    torch.manual_seed(0)
-    model = kassd(replace(SMALL, grid=grid, encoder_widths=(8, 16, 32, 32), encoder_out=32, width=32, kam_width=32))
-    batch = Batch.of([replace(frame, labels=labels)])
-    losses = overfit(model, batch, 80, 0.005)
+    frame = scan_with_cars(grid)
+    model = made(
+        "kassd", replace(KASSD, grid=grid, encoder_widths=(8, 16, 32, 32), encoder_out=32, width=32, kam_width=32)
+    )
+    losses = learn_by_heart(model, frame, 80, 0.005)
     assert losses[-1] < 0.1 * losses[0]
-    (found,) = model.decode(model(batch))
-    check_found(found[found.scores > 0.5].boxes.detach(), labels.boxes)
+    (found,) = model.decode(model(Batch.of([frame])))
+    boxes = found[found.scores > 0.5].boxes.detach()
+    check_found(boxes, frame.labels.boxes)
+    check_headings(boxes, frame.labels.boxes)
 
 
-def near_cars(labels: Labels, grid: VoxelGrid) -> Labels:
-    of_cars = labels.of_classes(("Car",))
-    return of_cars[grid.contains(of_cars.boxes)]
-
-
-def test_samples_of_a_batch_do_not_touch_each_other() -> None:
-    torch.manual_seed(0)
-    model = kassd(SMALL).eval()
+def test_scores_of_a_sample_do_not_depend_on_its_neighbours() -> None:
+    model = made("kassd").eval()
     one, two = car_frame(3, CAR), car_frame(4, CAR)
     alone, joined = model(Batch.of([two])), model(Batch.of([one, two]))
-    torch.testing.assert_close(joined.head.cls[1], alone.head.cls[0], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(joined.maps[1], alone.maps[0], atol=1e-5, rtol=1e-4)
     boxes = torch.tensor([CAR])
     arguments = (boxes, torch.zeros(1, dtype=torch.int64), boxes[:, :2])
     torch.testing.assert_close(
@@ -285,27 +205,16 @@ def test_samples_of_a_batch_do_not_touch_each_other() -> None:
     )
 
 
-@pytest.mark.parametrize("training", [True, False])
-def test_sweeps_without_points(training: bool) -> None:
-    model = kassd(SMALL).train(training)
-    empty = Frame(torch.zeros(0, 4), labels=Labels.empty())
-    predictions = model(Batch.of([empty, empty]))
-    assert len(model.decode(predictions)) == 2
-    losses = model.loss(predictions, [Labels.empty()] * 2)
-    assert all(bool(loss.isfinite()) for loss in losses.values())
-    total(losses).backward()
-
-
 def test_a_map_of_odd_size_works() -> None:
-    model = kassd(SMALL).eval()
-    predictions = model(Batch.of([car_frame(2, CAR)]), SMALL.grid.window((0, 0), (88, 104)))
+    model = kassd(KASSD).eval()
+    predictions = model(Batch.of([car_frame(2, CAR)]), KASSD.grid.window((0, 0), (88, 104)))
     assert predictions.maps.shape == (1, 31, 13, 11)
     assert predictions.head.cls.shape == (1, 13 * 11 * 2, 1)
 
 
-def test_is_built_by_name_and_survives_a_weight_file(tmp_path) -> None:
+def test_options_are_read_as_plain_values() -> None:
     options = {
-        **config_to_dict(SMALL),
+        **config_to_dict(KASSD),
         "neck": "spp",
         "lam_reduce": "mean",
         "keypoints": {"m": 7, "n": 4, "extra_point": "center"},
@@ -314,21 +223,16 @@ def test_is_built_by_name_and_survives_a_weight_file(tmp_path) -> None:
     model = build("kassd", options)
     assert model.config.neck is Neck.SPP and model.config.kam_options.score is KamScore.MULTIPLY
     assert model.config.keypoints == KeypointLayout(7, 4, 5, 4, ExtraPoint.CENTER)
-    save_weights(tmp_path / "w.safetensors", model)
-    again = load_weights(tmp_path / "w.safetensors")
-    assert again.config == model.config
-    batch = Batch.of([car_frame(1, CAR)])
-    torch.testing.assert_close(again(batch).maps, model.eval()(batch).maps)
 
 
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(BeamboxError, match=r"`neck`: .*'llm', 'second', 'psa', 'denseaspp' or 'spp', got 'fpn'"):
         build("kassd", {"neck": "fpn"})
     with pytest.raises(BeamboxError, match="`llm` off is SECOND's backbone, but `neck` asks for spp; change one"):
-        replace(SMALL, llm=False, neck=Neck.SPP)
+        replace(KASSD, llm=False, neck=Neck.SPP)
     with pytest.raises(BeamboxError, match="must have 1 entry or one for each of the 1 classes, got 2"):
-        replace(SMALL, kam_options=KamOptions(positive_iou=(0.7, 0.5)))
+        replace(KASSD, kam_options=KamOptions(positive_iou=(0.7, 0.5)))
     with pytest.raises(BeamboxError, match="`anchors` must name at least one class"):
-        replace(SMALL, anchors=())
+        replace(KASSD, anchors=())
     with pytest.raises(BeamboxError, match="without any keypoint"):
         build("kassd", {"keypoints": {"m": 0, "n": 0, "d": 0, "e": 0}})

@@ -10,15 +10,18 @@ import torch
 from torch import Tensor
 
 from beambox.detectors.catalogue import CATALOGUE
-from beambox.detectors.dennet import DenNetConfig
+from beambox.detectors.dennet import AttentionPosition, DenNetConfig
 from beambox.detectors.hcnet import HCNetConfig
-from beambox.detectors.kassd import KassdConfig
+from beambox.detectors.kassd import KamOptions, KassdConfig, KassdPredictions, Neck
 from beambox.detectors.pointpillars import PointPillarsConfig
 from beambox.detectors.second import KITTI_CAR, SecondConfig
-from beambox.detectors.voxel_rcnn import VoxelRcnnConfig
+from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, VoxelRcnnPredictions
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
+from beambox.layers.attention import Gate, HeightChannelKind
+from beambox.layers.density import CountSet, Normalisation
 from beambox.layers.heads import AnchorPredictions
+from beambox.layers.keypoints import ExtraPoint, KeypointLayout
 from beambox.layers.roi import ProposalLimits, RoiSampling
 from beambox.structures import Frame, Labels
 
@@ -77,6 +80,31 @@ SMALL: dict[str, Any] = {
     "second": SECOND,
     "voxel_rcnn": VOXEL_RCNN,
 }
+VARIANTS: dict[str, Any] = {
+    **SMALL,
+    "hcnet: HA, no OIFM": replace(HCNET, attention=HeightChannelKind.HEIGHT, oifm=False),
+    "hcnet: CA, sigmoid": replace(HCNET, attention=HeightChannelKind.CHANNEL, aam_gate=Gate.SIGMOID),
+    "hcnet: plain": replace(HCNET, attention=HeightChannelKind.NONE, aam=False, absolute_xy=False),
+    "hcnet: 8 slices, 3 classes": replace(
+        HCNET, grid=VoxelGrid((0, -10.24, -3), (20.48, 10.24, 1), (0.32, 0.32, 0.5)), anchors=KITTI_ANCHORS
+    ),
+    "kassd: baseline": replace(KASSD, llm=False, kam=False),
+    "kassd: plain LLM": replace(KASSD, frs_reuse=False, lam=False),
+    "kassd: PSA, corners": replace(KASSD, neck=Neck.PSA, keypoints=KeypointLayout(2, 2, 0, 0)),
+    "kassd: DenseASPP, inner": replace(KASSD, neck=Neck.DENSEASPP, keypoints=KeypointLayout(0, 0, 6, 3)),
+    "kassd: SPP, centre": replace(KASSD, neck=Neck.SPP, keypoints=KeypointLayout(extra_point=ExtraPoint.CENTER)),
+    "kassd: SECOND, soft": replace(
+        KASSD, neck=Neck.SECOND, kam_options=KamOptions(soft_targets=True, box_gradient=True)
+    ),
+    "kassd: 3 classes": replace(KASSD, anchors=KITTI_ANCHORS, kam_options=KamOptions(positive_iou=(0.7, 0.5, 0.5))),
+    "dennet: middle, points": replace(
+        DENNET, na_position=AttentionPosition.MIDDLE, na_mlp=False, count_set=CountSet.POINTS, own_points=True
+    ),
+    "dennet: share, collapsed, no NA": replace(
+        DENNET, normalisation=Normalisation.SHARE, max_count=16, density_collapse=True, na=False
+    ),
+}
+"""The small ones, and others with their switches set; the name before the colon is the catalogue's."""
 
 
 def made(name: str, config: Any = None, seed: int = 0) -> Any:
@@ -87,9 +115,16 @@ def made(name: str, config: Any = None, seed: int = 0) -> Any:
 
 def first_stage(predictions: Any) -> AnchorPredictions:
     """Return what the anchors of any detector say."""
-    if isinstance(predictions, AnchorPredictions):
-        return predictions
-    return predictions.first if hasattr(predictions, "first") else predictions.head
+    if isinstance(predictions, VoxelRcnnPredictions):
+        return predictions.first
+    return predictions.head if isinstance(predictions, KassdPredictions) else predictions
+
+
+def said(predictions: Any) -> list[Tensor]:
+    """Return the maps of a detector's predictions, ``(B, ...)`` each."""
+    first = first_stage(predictions)
+    maps = predictions.maps if isinstance(predictions, KassdPredictions) else None
+    return [first.cls, first.box, first.direction, *([] if maps is None else [maps])]
 
 
 def total(losses: dict[str, Tensor]) -> Tensor:
