@@ -70,8 +70,8 @@ class SubmanifoldConv3d(_Convolution):
         return submanifold_conv3d(x, self.kernel(scale), bias, self.geometry.dilation)
 
 
-class SparseConv3d(_Convolution):
-    """Strided convolution that activates every output within reach of an active input."""
+class _Strided(_Convolution):
+    """Convolution between two resolutions."""
 
     def __init__(
         self,
@@ -85,6 +85,10 @@ class SparseConv3d(_Convolution):
     ) -> None:
         geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
         super().__init__(in_channels, channels, geometry, bias)
+
+
+class SparseConv3d(_Strided):
+    """Strided convolution that activates every output within reach of an active input."""
 
     def forward(self, x: SparseTensor, scale: Tensor | None = None, shift: Tensor | None = None) -> SparseTensor:
         """Convolve; ``scale`` and ``shift``, one value an output channel, replace the bias by an affine map."""
@@ -93,21 +97,8 @@ class SparseConv3d(_Convolution):
         return sparse_conv3d(x, self.kernel(scale), bias, geometry.stride, geometry.padding, geometry.dilation)
 
 
-class InverseConv3d(_Convolution):
+class InverseConv3d(_Strided):
     """Transposed convolution onto the sites that a :class:`SparseConv3d` of the same geometry started from."""
-
-    def __init__(
-        self,
-        in_channels: int,
-        channels: int,
-        kernel: int | Triple = 3,
-        stride: int | Triple = 1,
-        padding: int | Triple = 0,
-        dilation: int | Triple = 1,
-        bias: bool = True,
-    ) -> None:
-        geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
-        super().__init__(in_channels, channels, geometry, bias)
 
     def forward(self, x: SparseTensor, onto: Sites) -> SparseTensor:
         """Carry features back onto ``onto``."""
