@@ -21,7 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "beambox.cli.demo:command",
         "simulate a few sweeps, detect, score, draw: under a minute, nothing else needed",
     ),
-    "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns"),
+    "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),

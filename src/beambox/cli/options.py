@@ -24,7 +24,9 @@ __all__ = [
     "parse_range",
 ]
 
-InputsArgument = Annotated[list[str], typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns.")]
+InputsArgument = Annotated[
+    list[str], typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns, recordings.")
+]
 ModelOption = Annotated[
     str, typer.Option("--model", "-m", metavar="M", help="Shipped name, .safetensors file, or folder of a run.")
 ]

@@ -28,6 +28,7 @@ from beambox.data.formats.columns import Columns
 from beambox.data.formats.las import read_las
 from beambox.data.formats.pcd import read_pcd
 from beambox.data.formats.ply import read_ply
+from beambox.data.formats.recording import read_message, recording_of
 from beambox.structures import Frame
 
 __all__ = ["SUFFIXES", "points_from_array", "read_frame", "read_points"]
@@ -65,7 +66,7 @@ def read_frame(
     Points with NaN or infinite coordinates are dropped. An empty cloud is a frame without points.
 
     Args:
-        path: the file; its ending tells the format.
+        path: the file; its ending tells the format. A sweep in a recording of ROS is RECORDING/TOPIC/NANOSECONDS.
         fields: names of columns, as a list or as "x,y,z,intensity,ring". For .bin and unnamed arrays: what each column
             of the file is, ``_`` for one to leave out; without it the first four are x, y, z, intensity. For formats
             that name their columns: which to take. Columns beyond x, y, z and intensity follow these, as ordered here.
@@ -111,6 +112,8 @@ def _read(path: Path, fields: str | Sequence[str] | None, scale: float | None) -
     suffix = path.suffix.lower()
     if suffix == ".bin":
         return _assemble(_bin_columns(path, names), str(path), names, scale)
+    if suffix not in READERS and recording_of(path) is not None:
+        return _assemble(read_message(path), str(path), names, scale)
     if suffix not in READERS:
         raise BeamboxError(f'{path} has the ending "{suffix}", which no reader knows{did_you_mean(suffix, SUFFIXES)}')
     columns = READERS[suffix](path)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from beambox.checks import BeamboxError, MissingFileError
+from beambox.data.formats.recording import ENDINGS, recording_of, sweeps_in
 from beambox.data.kitti import DEFAULT_IMAGE_SIZE, png_size, read_calibration, read_labels
 from beambox.data.reading import SUFFIXES, read_frame
 from beambox.structures import Frame
@@ -28,7 +29,8 @@ class Sweep:
 def find_sweeps(inputs: Sequence[str | Path]) -> list[Sweep]:
     """List the sweeps that files, folders and patterns name, in order and without repeats.
 
-    A folder gives its sweeps, sorted; one in KITTI's layout those of velodyne/ or training/velodyne/.
+    A folder gives its sweeps, sorted; one in KITTI's layout those of velodyne/ or training/velodyne/. A recording of
+    ROS (.bag, .mcap, .db3, a folder of rosbag2) gives its point clouds, as paths RECORDING/TOPIC/NANOSECONDS.
 
     Raises:
         MissingFileError: if a file, folder or pattern names nothing.
@@ -41,22 +43,29 @@ def find_sweeps(inputs: Sequence[str | Path]) -> list[Sweep]:
 
 def _expand(given: str) -> list[Path]:
     path = Path(given)
+    if recording_of(path) is not None:
+        return sweeps_in(path)
     if path.is_dir():
         for folder in (path, path / "velodyne", path / "training" / "velodyne", path / "testing" / "velodyne"):
-            found = sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES)
+            found = sorted(p for p in folder.glob("*") if p.suffix.lower() in (*SUFFIXES, *ENDINGS))
             if found:
-                return found
+                return _each(found)
         raise MissingFileError(f"{given} holds no sweep; looked for {' '.join('*' + e for e in SUFFIXES)}")
     if path.exists():
         return [path]
     if glob.has_magic(given):
         found = sorted(Path(p) for p in glob.glob(given, recursive=True) if Path(p).is_file())
         if found:
-            return found
+            return _each(found)
         raise MissingFileError(f"no file fits the pattern {given}")
     beside = sorted(p.name for p in path.parent.glob("*") if p.suffix.lower() in SUFFIXES)[:3]
     hint = f"; {path.parent}/ holds {', '.join(beside)} ..." if beside else ""
     raise MissingFileError(f"{given} is not there{hint}")
+
+
+def _each(paths: Sequence[Path]) -> list[Path]:
+    """Put the sweeps of recordings in their places."""
+    return [sweep for path in paths for sweep in (sweeps_in(path) if path.suffix.lower() in ENDINGS else [path])]
 
 
 def _named(paths: list[Path]) -> list[Sweep]:

@@ -33,7 +33,7 @@ class Columns:
         return len(self.arrays[0]) if self.arrays else 0
 
 
-def library(name: str, path: Path) -> ModuleType:
+def library(name: str, path: Path, extra: str = "formats") -> ModuleType:
     """Import an optional library that reads a format.
 
     Raises:
@@ -43,8 +43,8 @@ def library(name: str, path: Path) -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         raise BeamboxError(
-            f"reading {path.suffix} files ({path.name}) needs the library {name}: "
-            'pip install "beambox[formats]", or convert the file to .npy'
+            f"reading {path.suffix or 'such'} files ({path.name}) needs the library {name.split('.', maxsplit=1)[0]}: "
+            f'pip install "beambox[{extra}]", or convert the file to .npy'
         ) from None
 
 
