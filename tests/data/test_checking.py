@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,6 +75,35 @@ def test_check_accuses(tmp_path: Path, change: Callable, wanted: list[str]) -> N
 def test_check_measures_the_ground(tmp_path: Path) -> None:
     told = found(write_pandaset(tmp_path, 2, "sensor_height: 0.5\n"))
     assert told == ["the ground lies 1.50 m below where sensor_height puts it; raise sensor_height by 1.50"]
+
+
+def test_check_measures_a_ground_that_leans(tmp_path: Path) -> None:
+    path = write_pandaset(tmp_path, 2, "sensor_height: 2\n", lean)
+    for sweep in sorted((tmp_path / "velodyne").iterdir()):
+        points = np.fromfile(sweep, "<f4").reshape(-1, 4)
+        points[:, 2] += 0.01 * points[:, 0] - 0.04 * points[:, 1]
+        points.tofile(sweep)
+    (told,) = found(path)
+    got = re.fullmatch(
+        r"the ground rises by (\d\.\d)% to the right, 1\.\d m at 40 m; "
+        r"add \{forward: (0\.0\d+), left: (-0\.0\d+)\} to ground_slope",
+        told,
+    )
+    assert got is not None
+    assert float(got[2]) == pytest.approx(0.01, abs=0.003)
+    assert float(got[3]) == pytest.approx(-0.04, abs=0.003)
+    path.write_text(path.read_text() + "ground_slope: {forward: 0.01, left: -0.04}\n")
+    assert found(path) == []
+    frame = CustomSource(path)[0]
+    level = write_pandaset(tmp_path / "level", 1, "sensor_height: 2\n")
+    wanted = CustomSource(level)[0]
+    assert torch.allclose(frame.points, wanted.points, atol=1e-4)
+    assert torch.allclose(frame.labels.boxes, wanted.labels.boxes, atol=1e-3)
+
+
+def lean(boxes: np.ndarray) -> np.ndarray:
+    boxes[:, 2] += 0.01 * boxes[:, 0] - 0.04 * boxes[:, 1]
+    return boxes
 
 
 def test_check_lists_frames(tmp_path: Path) -> None:

@@ -185,6 +185,8 @@ def test_splits_are_lists_of_names(folder: tuple[Path, str]) -> None:
         ({"axes": '"x: forward, y: up"'}, "z must lead up or down"),
         ({"axes": '"x: forth, y: up"'}, 'unknown direction "forth"'),
         ({"range": "[0, 0, -1, 1]"}, "range is x0, y0, x1, y1 with x0 < x1"),
+        ({"ground_slope": "{left: 3}"}, "ground_slope.left: Input should be less than or equal to 0.3"),
+        ({"ground_slope": "{right: 0}"}, "ground_slope.right: Extra inputs are not permitted"),
         ({"sensor_height": "high"}, "sensor_height: Input should be a valid number"),
         ({"labels": "all.txt"}, r"boxes in pandaset format come as one file a frame"),
         ({"points": "none/{frame}.bin"}, r"none, the folder of the sweeps, is not there"),

@@ -46,7 +46,7 @@ def test_boxes_stay_around_their_points(axes: Axes) -> None:
     """A box found around turned points, carried back, has its corners at the given points."""
     generator = torch.Generator().manual_seed(3)
     boxes = torch.rand(5, 7, generator=generator, dtype=torch.float64) * 6 + 0.5
-    here = Corrections(axes, raise_by=0.4)
+    here = Corrections(axes, raise_by=0.4, slope=(0.02, -0.05))
     given_corners = corners_bev(boxes)  # (5, 4, 2), in the given frame
     points = torch.cat((given_corners.reshape(-1, 2), torch.zeros(20, 2, dtype=torch.float64)), dim=1)
     seen = here.apply(Frame(points.float())).points[:, :2].reshape(5, 4, 2)
@@ -76,3 +76,14 @@ def test_boxes_of_points_with_a_lying_z_stay_in_the_usual_frame() -> None:
 def test_no_correction_is_no_change() -> None:
     frame = Frame(torch.rand(3, 4))
     assert Corrections().apply(frame) is frame
+
+
+def test_a_slope_is_taken_from_points_and_given_back_to_boxes() -> None:
+    x, y = torch.meshgrid(torch.arange(-20.0, 21, 5), torch.arange(-20.0, 21, 5), indexing="ij")
+    ground = torch.stack((x, y, 0.02 * x - 0.03 * y - 2, torch.zeros_like(x)), dim=2).reshape(-1, 4)
+    here = Corrections(raise_by=0.27, slope=(0.02, -0.03))
+    assert here.apply(Frame(ground)).points[:, 2].tolist() == pytest.approx([-1.73] * 81, abs=1e-5)
+    boxes = torch.tensor([[10.0, -10.0, -0.75, 4.0, 1.8, 1.5, 0.3]], dtype=torch.float64)
+    seen = here.carry_forward(boxes)
+    assert seen[0, 2].item() == pytest.approx(-0.75 + 0.27 - 0.2 - 0.3)
+    assert torch.allclose(here.carry_back(detections(seen)).boxes, boxes)

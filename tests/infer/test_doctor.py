@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,17 @@ def test_another_height_is_measured(tmp_path: Path, height: float) -> None:
     assert diagnosis.options[0] == "--sensor-height"
     assert float(diagnosis.options[1]) == pytest.approx(height, abs=0.05)
     assert diagnosis.corrections.raise_by == pytest.approx(height - 1.73, abs=0.05)
+
+
+def test_a_ground_that_leans_is_a_note_with_the_option(tmp_path: Path) -> None:
+    points = street()
+    points[:, 2] += 0.01 * points[:, 0] - 0.05 * points[:, 1]
+    diagnosis = diagnose(points, tmp_path)
+    (slope,) = [finding for finding in diagnosis.findings if finding.about == "slope"]
+    assert slope.level == "note" and slope.option == ()
+    forward, left = re.findall(r"--ground-slope (\S+),(\S+) makes it level", slope.text)[0]
+    assert float(forward) == pytest.approx(0.01, abs=0.005)
+    assert float(left) == pytest.approx(-0.05, abs=0.005)
 
 
 @pytest.mark.parametrize("axes", ["x: right, y: forward, z: up", "x: backward, y: right, z: up",

@@ -20,8 +20,10 @@ __all__ = [
     "ModelOption",
     "PrecisionOption",
     "RangeOption",
+    "SlopeOption",
     "ViewOption",
     "parse_range",
+    "parse_slope",
 ]
 
 InputsArgument = Annotated[
@@ -50,6 +52,14 @@ HeightOption = Annotated[
     ),
 ]
 AxesOption = Annotated[str, typer.Option(metavar="A", help='Where your x and y lead, such as "x: right, y: forward".')]
+SlopeOption = Annotated[
+    str,
+    typer.Option(
+        "--ground-slope",
+        metavar="F,L",
+        help="Rise of the ground forward and left, metres a metre: 0,-0.03.",
+    ),
+]
 IntensityOption = Annotated[
     float | None,
     typer.Option("--intensity-scale", metavar="F", help="Factor that brings intensity to 0..1, e.g. 0.01."),
@@ -79,3 +89,18 @@ def parse_range(text: str, option: str = "--range") -> float | list[float] | Non
     if len(numbers) not in (1, 4):
         raise BeamboxError(f'{option} takes one number, or four as x0,y0,x1,y1 in metres, got "{text}"')
     return numbers[0] if len(numbers) == 1 else numbers
+
+
+def parse_slope(text: str) -> tuple[float, float]:
+    """Read the value of --ground-slope.
+
+    Raises:
+        BeamboxError: if it is not two small numbers.
+    """
+    try:
+        numbers = [float(word) for word in text.split(",")] if text else [0.0, 0.0]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 2 or max(map(abs, numbers)) > 0.3:
+        raise BeamboxError(f'--ground-slope takes two numbers from -0.3 to 0.3, forward and left, got "{text}"')
+    return numbers[0], numbers[1]

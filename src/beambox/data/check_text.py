@@ -15,6 +15,8 @@ MANY = 0.5
 """Share of a class's boxes from which a fault is taken to be one of the data set, not of single boxes."""
 UNEVEN = 0.2
 """The ground may lie this far from where the sensor's height puts it, metres; more costs 3-D overlap."""
+STEEP = 0.02
+"""A ground that leans by this much in most frames is reported, metres a metre; KITTI's rises by 0.008 ahead."""
 FEW_BOXES = 5
 """Fewer telling boxes than this do not accuse a class."""
 
@@ -69,7 +71,22 @@ def warnings(report: DataReport, ground: float | None = None) -> list[str]:
         if abs(wrong) > UNEVEN:
             side = "above" if wrong > 0 else "below"
             out.append(f"the ground lies {abs(wrong):.2f} m {side} where sensor_height puts it; {_advice(wrong)}")
-    return out
+    return out + _leaning(report)
+
+
+def _leaning(report: DataReport) -> list[str]:
+    """Tell of a ground that leans the same way in most frames."""
+    if not report.slopes:
+        return []
+    forward, left = np.median(report.slopes, axis=0)
+    if np.hypot(forward, left) < STEEP:
+        return []
+    ways = [("ahead", "behind", forward), ("to the left", "to the right", left)]
+    up, down, most = max(ways, key=lambda way: abs(way[2]))
+    return [
+        f"the ground rises by {abs(most):.1%} {up if most > 0 else down}, {40 * abs(most):.1f} m at 40 m; "
+        f"add {{forward: {forward:.3f}, left: {left:.3f}}} to ground_slope"
+    ]
 
 
 def _advice(wrong: float) -> str:

@@ -127,6 +127,8 @@ class DataReport:
     """Points of each frame."""
     ground: list[float] = field(default_factory=list)
     """Height of the fitted ground under the origin, where one was found."""
+    slopes: list[tuple[float, float]] = field(default_factory=list)
+    """Metres that the fitted ground rises a metre forward and to the left, likewise."""
     intensity: list[tuple[float, float]] = field(default_factory=list)
     """Lowest and highest intensity of each frame."""
     notes: dict[str, int] = field(default_factory=dict)
@@ -152,7 +154,9 @@ class DataReport:
         else:
             self.without_points.append(frame.id)
         if frame.plane is not None:
-            self.ground.append(float(-frame.plane[3] / frame.plane[2]))
+            a, b, c, d = frame.plane.tolist()
+            self.ground.append(-d / c)
+            self.slopes.append((-a / c, -b / c))
         if frame.labels is None:
             self.unlabelled.append(frame.id)
             return

@@ -8,16 +8,28 @@ from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.files import read_text
 from beambox.geometry.axes import Axes
 
-__all__ = ["KITTI_GROUND", "CustomConfig", "read_custom_config"]
+__all__ = ["KITTI_GROUND", "CustomConfig", "GroundSlope", "read_custom_config"]
 
 KITTI_GROUND = -1.73
 """Height of the ground in frames whose sensor height is known, metres: KITTI's, which shipped weights expect."""
 EVERYTHING_ELSE = "*"
+
+
+class GroundSlope(BaseModel):
+    """How the ground rises, in metres a metre, where the sensor is mounted askew or the road leans all along."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    forward: float = Field(default=0.0, ge=-0.3, le=0.3)
+    """Metres that the ground rises a metre ahead."""
+    left: float = Field(default=0.0, ge=-0.3, le=0.3)
+    """Metres that the ground rises a metre to the left."""
 
 
 class CustomConfig(BaseModel):
@@ -39,6 +51,8 @@ class CustomConfig(BaseModel):
     sensor_height: float | None = Field(default=None, ge=-10, le=100)
     """Metres from the ground up to the origin of the points: 0 if z = 0 is the ground. Frames are then shifted so that
     the ground lies at -1.73 m, as in KITTI. Without it z stays as it is."""
+    ground_slope: GroundSlope = GroundSlope()
+    """How the ground rises; points and boxes are shifted in z so that it lies level."""
     fields: str | None = None
     """Columns of .bin and .npy files, as ``x,y,z,intensity,ring``; ``_`` leaves one out."""
     intensity_scale: float | None = Field(default=None, gt=0)
@@ -116,6 +130,10 @@ class CustomConfig(BaseModel):
     def raise_by(self) -> float:
         """Metres added to z, after the axes have been turned."""
         return 0.0 if self.sensor_height is None else self.sensor_height + KITTI_GROUND
+
+    def level(self, z: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Return z shifted to KITTI's height and with the ground's slope taken away; axes have been turned."""
+        return z + (self.raise_by - self.ground_slope.forward * x - self.ground_slope.left * y)
 
     def class_of(self, name: str, where: str) -> str | None:
         """Return the class wanted for a name in the files, or None to leave it out.

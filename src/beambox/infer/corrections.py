@@ -21,6 +21,9 @@ class Corrections:
     raise_by: float = 0.0
     """Metres added to z: this sensor's height above the ground less that of the training data's."""
 
+    slope: tuple[float, float] = (0.0, 0.0)
+    """Metres that the ground rises a metre forward and a metre to the left; taken away from z."""
+
     @property
     def nothing(self) -> bool:
         """Whether points stay as they are."""
@@ -32,7 +35,7 @@ class Corrections:
             return frame
         points = frame.points.clone()
         points[:, :3] = points[:, :3] @ self.axes.matrix.T.to(points)
-        points[:, 2] += self.raise_by
+        points[:, 2] += self._shift(points)
         return frame.with_points(points)
 
     def carry_back(self, detections: Detections) -> Detections:
@@ -41,7 +44,7 @@ class Corrections:
         Where the given z is not vertical, a box cannot turn about it: boxes then stay in x forward, y left, z up.
         """
         boxes = detections.boxes.clone()
-        boxes[:, 2] -= self.raise_by
+        boxes[:, 2] -= self._shift(boxes)
         if self.axes.vertical_z:
             boxes = turn_boxes(boxes, self.axes.matrix.T)  # the inverse of a rotation is its transpose
         return replace(detections, boxes=boxes)
@@ -49,5 +52,9 @@ class Corrections:
     def carry_forward(self, boxes: Tensor) -> Tensor:
         """Bring ``(N, 7)`` boxes of the given frame to where :meth:`apply` brings its points."""
         boxes = turn_boxes(boxes, self.axes.matrix) if self.axes.vertical_z else boxes.clone()
-        boxes[:, 2] += self.raise_by
+        boxes[:, 2] += self._shift(boxes)
         return boxes
+
+    def _shift(self, rows: Tensor) -> Tensor:
+        """Metres added to z of points or boxes whose axes have been turned: ``(N,)``."""
+        return self.raise_by - self.slope[0] * rows[:, 0] - self.slope[1] * rows[:, 1]

@@ -21,6 +21,9 @@ from beambox.structures import Frame
 
 __all__ = ["Diagnosis", "Finding", "examine"]
 
+STEEP = 0.03
+"""A ground that rises by more than this is told of, metres a metre; KITTI's rises by 0.008 on average."""
+
 Level = Literal["good", "note", "bad"]
 
 
@@ -79,7 +82,8 @@ def examine(path: Path | str, trained: Trained, fields: str | Sequence[str] | No
     fixed = turned.clone()
     fixed[:, 2] += raised
     bright_finding, scale = _intensity(frame, path, trained, fields)
-    findings += [axes_finding, height_finding, _range(turned, fixed, trained), _density(fixed, trained), bright_finding]
+    findings += [axes_finding, height_finding, _slope(turned)]
+    findings += [_range(turned, fixed, trained), _density(fixed, trained), bright_finding]
     kept = tuple(finding for finding in findings if finding is not None)
     return Diagnosis(kept, Corrections(axes, raised), scale)
 
@@ -181,6 +185,23 @@ def _height(points: Tensor, trained: Trained) -> tuple[Finding, float]:
         return Finding("height", "good", text), 0.0
     option = ("--sensor-height", f"{round(height, 2) + 0.0:g}")
     return Finding("height", "bad", text, option), round(height, 2) - trained.sensor_height
+
+
+def _slope(points: Tensor) -> Finding | None:
+    """Tell of a ground that leans: one sweep cannot say whether the road does so or the sensor, so this is a note."""
+    plane = fit_road_plane(points)
+    if plane is None:
+        return None
+    a, b, c, _ = plane.tolist()
+    forward, left = round(-a / c, 3) + 0.0, round(-b / c, 3) + 0.0
+    if not STEEP < math.hypot(forward, left) < math.tan(math.radians(6)):
+        return None
+    return Finding(
+        "slope",
+        "note",
+        f"the ground rises by {forward:.1%} forward and {left:.1%} to the left, in training hardly; "
+        f"if every sweep says so, --ground-slope {forward:g},{left:g} makes it level",
+    )
 
 
 def _range(given: Tensor, fixed: Tensor, trained: Trained) -> Finding:

@@ -268,6 +268,7 @@ def load(
     view: View = "auto",
     sensor_height: float | None = None,
     axes: str | Axes | None = None,
+    ground_slope: tuple[float, float] = (0.0, 0.0),
     intensity_scale: float | None = None,
     fields: str | Sequence[str] | None = None,
     batch_size: int = 1,
@@ -284,6 +285,7 @@ def load(
         sensor_height: metres of this sensor above the ground (0 where the points' origin lies on it), where that
             differs from the training sensor's.
         axes: where x and y lead, such as ``"x: right, y: forward"``, where that is not forward and left.
+        ground_slope: metres that the ground rises a metre forward and a metre to the left, where it does not lie level.
         intensity_scale: factor that brings the intensity to [0, 1], such as 0.01 for percent; None finds it from the
             numbers, as :mod:`beambox.data.reading` says.
         fields: names of the columns of files that do not name them, such as "x,y,z,intensity,ring".
@@ -300,6 +302,7 @@ def load(
     corrections = Corrections(
         axes=Axes.parse(axes) if isinstance(axes, str) else axes or Axes(),
         raise_by=0.0 if sensor_height is None else sensor_height - trained,
+        slope=ground_slope,
     )
     grid: VoxelGrid = model.config.grid
     return Detector(
