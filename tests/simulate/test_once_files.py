@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -113,10 +114,14 @@ def test_other_layouts_and_views_are_refused(written, tmp_path) -> None:
     with pytest.raises(BeamboxError, match="ONCE labels the whole turn"):
         write_dataset(tmp_path / "d", 1, QUICK, view="camera", files="once")
     assert not (tmp_path / "d").exists()
-    with pytest.raises(BeamboxError, match="was simulated with view 'full', now 'camera' is asked for"):
+    with pytest.raises(BeamboxError, match="was simulated with files 'once', now 'kitti' is asked for"):
         write_dataset(written, 5, QUICK, seed=3, val_share=0.4)
     with pytest.raises(BeamboxError, match="was simulated with sequence_length 2, now 3 is asked for"):
         write_dataset(written, 5, QUICK, seed=3, val_share=0.4, files="once", sequence_length=3)
+    with pytest.raises(BeamboxError, match="was simulated with sensor 'quick', now 'pandar40' is asked for"):
+        write_dataset(written, 5, seed=3, val_share=0.4, files="once", sequence_length=2)
+    with pytest.raises(BeamboxError, match=r"was simulated with sensor.height 1.8, now 2.0 is asked for"):
+        write_dataset(written, 5, replace(QUICK, height=2.0), seed=3, val_share=0.4, files="once", sequence_length=2)
     (tmp_path / "real/data").mkdir(parents=True)
     with pytest.raises(BeamboxError, match="holds other data"):
         write_dataset(tmp_path / "real", 1, QUICK, files="once")

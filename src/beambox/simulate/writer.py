@@ -86,8 +86,8 @@ def write_dataset(
         raise BeamboxError("ONCE labels the whole turn; leave out `view`, or give full")
     check_layout(layout)
     options = {"sensor": sensor, "view": view, "layout": layout, "layout_split": layout_split}
-    card = {**options, "sensor": json.loads(json.dumps(asdict(sensor))), "seed": seed, "val_share": val_share}
-    _claim(out, {**card, "files": files, "sequence_length": sequence_length if once else None})
+    card = {"files": files, "seed": seed, "val_share": val_share, "sequence_length": sequence_length if once else None}
+    _claim(out, {**card, **options, "sensor": json.loads(json.dumps(asdict(sensor)))})
     layer = (
         OnceFiles(str(out), seed, options, val_share, sequence_length)
         if once
@@ -150,14 +150,23 @@ def _claim(out: Path, card: dict) -> None:
         before = {"files": "kitti", **before}  # cards of old name no layout
         for key, value in card.items():
             if before.get(key) != value:
+                what, then, now = _difference(key, before.get(key), value)
                 raise BeamboxError(
-                    f"{out} was simulated with {key} {before.get(key)!r}, now {value!r} is asked for; "
+                    f"{out} was simulated with {what} {then!r}, now {now!r} is asked for; "
                     "give the same options to go on, or another folder"
                 )
         return
     if any((out / name).exists() for name in ("training", "data", "ImageSets")):
         raise BeamboxError(f"{out} holds other data (no {_CARD}); give another folder")
     write_text(path, json.dumps({**card, "beambox": __version__}, indent=1) + "\n")
+
+
+def _difference(key: str, then: Any, now: Any) -> tuple[str, Any, Any]:
+    """Name what differs in an entry of the card; of two sensors the name, or the first value that differs."""
+    if key != "sensor" or not isinstance(then, dict) or not isinstance(now, dict):
+        return key, then, now
+    field = next(field for field in now if then.get(field) != now[field])
+    return ("sensor", then[field], now[field]) if field == "name" else (f"sensor.{field}", then.get(field), now[field])
 
 
 def _work(write: Callable[[range], int], tasks: list[range], workers: int) -> Iterator[int]:
