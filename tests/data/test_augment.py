@@ -23,6 +23,7 @@ from beambox.data.augment import (
     sample_objects,
     scale,
     shuffle_points,
+    translate,
 )
 from beambox.data.database import ObjectDatabase
 from beambox.data.footprints import overlap_bev
@@ -98,6 +99,7 @@ def test_steps_have_inverses(seed: int, angle: float, factor: float) -> None:
         flip_y,
         lambda frame: rotate(frame, 0.7),
         lambda frame: scale(frame, 1.05),
+        lambda frame: translate(frame, np.array([0.5, -2.0, 0.3])),
         lambda frame: move_objects(frame, np.random.default_rng(3), 0.7, (1.0, 1.0, 0.5)),
         lambda frame: shuffle_points(frame, np.random.default_rng(3)),
     ],
@@ -199,8 +201,12 @@ def test_one_step_does_not_change_the_numbers_of_another() -> None:
     frame = scene(3)
     plain = AugmentConfig(sample={}, shuffle=False)
     noisy = AugmentConfig(sample={}, shuffle=False, object_rotation=0.2)
+    shifted = AugmentConfig(sample={}, shuffle=False, translation=(0.0, 0.0, 0.3))
     road = [augment(frame, np.random.default_rng(5), config).points[200:] for config in (plain, noisy)]
     torch.testing.assert_close(road[0], road[1])
+    moved = augment(frame, np.random.default_rng(5), shifted).points[200:] - road[0]
+    torch.testing.assert_close(moved[:, :2], torch.zeros_like(moved[:, :2]))
+    assert float(moved[:, 2].std()) < 1e-5 < abs(float(moved[:, 2].mean()))
 
 
 def test_bad_settings_and_frames_are_refused() -> None:

@@ -1,7 +1,7 @@
 """Augmentation of labelled sweeps, in the order of SECOND and PointPillars; every step is frame in, frame out.
 
 1. objects from the database (``sample``), 2. every object turned and shifted by itself (``object_*``), 3. mirrored,
-4. the whole turned about the sensor, 5. scaled, 6. points shuffled. Points move with their boxes.
+4. the whole turned about the sensor, 5. scaled, 6. shifted, 7. points shuffled. Points move with their boxes.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ __all__ = [
     "sample_objects",
     "scale",
     "shuffle_points",
+    "translate",
 ]
 
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -64,6 +65,8 @@ class AugmentConfig(BaseModel):
     """The whole turns about the sensor by U(-this, this), radians."""
     scaling: tuple[float, float] = (0.95, 1.05)
     """The whole is scaled by U(lowest, highest)."""
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The whole shifts by N(0, this) along x, y, z, metres (CenterPoint, section 5)."""
     shuffle: bool = True
     """Shuffle the points, so that a limit of points a cell keeps a random subset."""
 
@@ -92,7 +95,7 @@ def augment(
     if frame.labels is None:
         raise BeamboxError(f"only labelled frames can be augmented, but {frame.id or 'this one'} has no labels")
     # keep the draws in one order whatever is switched on, so that one step's setting does not change another's numbers
-    noise_rng, shuffle_rng = rng.spawn(2)
+    noise_rng, shuffle_rng, shift_rng = rng.spawn(3)
     mirror_x, mirror_y = rng.random(2)
     angle, factor = rng.uniform(-1, 1), rng.uniform(*config.scaling)
     if database is not None:
@@ -108,6 +111,8 @@ def augment(
         frame = flip_y(frame)
     frame = rotate(frame, angle * config.rotation)
     frame = scale(frame, factor)
+    if any(sigma > 0 for sigma in config.translation):
+        frame = translate(frame, shift_rng.normal(0.0, 1.0, 3) * config.translation)
     return shuffle_points(frame, shuffle_rng) if config.shuffle else frame
 
 
@@ -232,6 +237,15 @@ def scale(frame: Frame, factor: float) -> Frame:
     points[:, :3] *= factor
     labels = _labels(frame)
     return replace(frame, points=points, labels=labels.with_boxes(scale_boxes(labels.boxes, factor)))
+
+
+def translate(frame: Frame, shift: np.ndarray) -> Frame:
+    """Shift points and boxes by ``(3,)`` metres along x, y, z."""
+    points, boxes = frame.points.clone(), _labels(frame).boxes.clone()
+    offset = torch.from_numpy(shift).to(points.dtype)
+    points[:, :3] += offset
+    boxes[:, :3] += offset
+    return replace(frame, points=points, labels=_labels(frame).with_boxes(boxes))
 
 
 def shuffle_points(frame: Frame, rng: np.random.Generator) -> Frame:
