@@ -66,8 +66,10 @@ def command(
     optim = read.optim
     length = f"{optim.iterations} steps" if optim.iterations else f"{optim.epochs:g} epochs"
     assert read.validation is not None
+    overlaps = "".join(f", {name} at IoU {iou:g}" for name, iou in read.validation.iou.items())
     told = (
-        f"recipe {read.name}, {length}, batch {optim.batch}, seeds {seeds}; scored on `{read.validation.source.split}`"
+        f"recipe {read.name}, {length}, batch {optim.batch}, seeds {seeds}; "
+        f"scored on `{read.validation.source.split}`{overlaps}"
     )
     print(report(chosen, measured, told), end="")
     if json_file is not None:
