@@ -171,6 +171,7 @@ class Side:
     def __init__(self, name: str, threads: int, arguments: argparse.Namespace) -> None:
         paths = [str(ROOT / "src")] + ([str(arguments.spconv)] if arguments.spconv else [])
         environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "PYTHONWARNINGS": "ignore"}
+        environment.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line sets it
         environment["PYTHONPATH"] = os.pathsep.join([*paths, environment.get("PYTHONPATH", "")])
         command = [sys.executable, __file__, str(arguments.scan), "--side", name, "--threads", str(threads)]
         command += ["--dtype", arguments.dtype if name == "ours" else "float32"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import inspect
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -112,6 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Raises:
         SystemExit: 0 where all went well, 2 for anything the user can mend, 130 after an interrupt.
     """
+    # torch's threads otherwise wait for their next piece of work in a loop of some ms, on a core that others want
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help", "help"):
         print(help_text())

@@ -45,16 +45,12 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
     rows, c_out = len(pairs.target), weight.shape[2]
     blocks = pairs.blocks
     out = features.new_empty((rows + len(blocks.count), c_out + -c_out % _lanes(weight)))
-    if bias is None:
-        out.zero_()
-    else:
-        out.copy_(_filled(bias).expand_as(out))
-    if len(features):
-        x, w, y = features.contiguous().numpy(), _filled(weight).contiguous().numpy(), out.numpy()
-        source, target = blocks.source.reshape(-1), blocks.target.reshape(-1)
-        run_in_blocks(
-            lambda first, last: _multiply(x, w, source, target, blocks.count, y, first, last), len(blocks.count)
-        )
+    start = _filled(features.new_zeros(c_out) if bias is None else bias).numpy()
+    x, w, y = features.contiguous().numpy(), _filled(weight).contiguous().numpy(), out.numpy()
+    source, target, order = blocks.source.reshape(-1), blocks.target.reshape(-1), pairs.target.order.numpy()
+    run_in_blocks(
+        lambda first, last: _multiply(x, w, start, source, target, order, blocks.count, y, first, last), len(blocks.count)
+    )
     return out[:rows, :c_out].contiguous()
 
 
@@ -123,28 +119,31 @@ def _filled(values: Tensor) -> Tensor:
 
 
 @jit
-def _multiply(x, weight, source, target, count, out, first_block, last_block):
+def _multiply(x, weight, start, source, target, order, count, out, first_block, last_block):
+    """Fill a block's rows with ``start``, and the row that its incomplete tiles write to; then add the products."""
     offsets = weight.shape[0]
     lanes = VECTOR_BYTES // x.itemsize
     vectors = weight.shape[2] // lanes
-    block_rows = len(source) // count.size
     for block in range(first_block, last_block):
+        for i in range(block * BLOCK, min(len(order), (block + 1) * BLOCK)):
+            out[order[i]] = start
+        out[len(order) + block] = start
         for k in range(offsets):
-            start = (block * offsets + k) * block_rows
-            stop = start + count[block, k]
+            begin = (block * offsets + k) * BLOCK
+            stop = begin + count[block, k]
             v = 0
             while v < vectors:
                 left = vectors - v
                 if WIDE >= 4 and left >= 4:
-                    for first in range(start, stop, ROWS):
+                    for first in range(begin, stop, ROWS):
                         _rows_4(x, weight, out, source, target, first, k, v * lanes)
                     v += 4
                 elif left >= 2:
-                    for first in range(start, stop, ROWS):
+                    for first in range(begin, stop, ROWS):
                         _rows_2(x, weight, out, source, target, first, k, v * lanes)
                     v += 2
                 else:
-                    for first in range(start, stop, ROWS):
+                    for first in range(begin, stop, ROWS):
                         _rows_1(x, weight, out, source, target, first, k, v * lanes)
                     v += 1
 
