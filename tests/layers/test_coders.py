@@ -23,6 +23,13 @@ def test_decode_inverts_encode(values) -> None:
     torch.testing.assert_close(decode_boxes(encode_boxes(boxes, anchors), anchors), boxes)
 
 
+def test_sizes_stay_finite_whatever_the_codes() -> None:
+    anchor = torch.tensor([0.0, 0.0, 0.0, 3.9, 1.6, 1.5, 0.0])
+    wild = decode_boxes(torch.tensor([0.0, 0.0, 0.0, 120.0, 7.0, 6.0, 0.0]), anchor)
+    assert torch.isfinite(wild).all()
+    torch.testing.assert_close(wild[3:6], anchor[3:6] * torch.tensor([1000.0, 1000.0, math.exp(6)]))
+
+
 def test_direction_bins_of_known_headings() -> None:
     assert direction_bin(torch.tensor([0.1, 2.0, -2.0, 3.0])).tolist() == [1, 0, 1, 0]
 

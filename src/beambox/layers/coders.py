@@ -13,6 +13,8 @@ __all__ = ["DIRECTION_OFFSET", "decode_boxes", "direction_bin", "encode_boxes", 
 
 DIRECTION_OFFSET = 0.78539
 """Radians by which the two heading bins are turned, so that no common heading lies on their border."""
+LARGEST_GROWTH = math.log(1000)
+"""Sizes are decoded to at most a thousand anchors: a network that is hardly trained may ask for e^100 and more."""
 
 
 def encode_boxes(boxes: Tensor, anchors: Tensor) -> Tensor:
@@ -37,11 +39,14 @@ def encode_boxes(boxes: Tensor, anchors: Tensor) -> Tensor:
 
 
 def decode_boxes(codes: Tensor, anchors: Tensor) -> Tensor:
-    """Inverse of :func:`encode_boxes`; headings are known up to half a turn until :func:`resolve_heading`."""
+    """Inverse of :func:`encode_boxes`; headings are known up to half a turn until :func:`resolve_heading`.
+
+    Sizes stay finite whatever the codes: they grow to at most a thousand times the anchor's.
+    """
     diagonal = torch.linalg.vector_norm(anchors[..., 3:5], dim=-1, keepdim=True)
     reach = torch.cat((diagonal, diagonal, anchors[..., 5:6]), dim=-1)
     centre = codes[..., :3] * reach + anchors[..., :3]
-    size = torch.exp(codes[..., 3:6]) * anchors[..., 3:6]
+    size = torch.exp(codes[..., 3:6].clamp(max=LARGEST_GROWTH)) * anchors[..., 3:6]
     return torch.cat((centre, size, codes[..., 6:7] + anchors[..., 6:7]), dim=-1)
 
 
