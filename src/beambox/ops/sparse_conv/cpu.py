@@ -49,7 +49,8 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
     x, w, y = features.contiguous().numpy(), _filled(weight).contiguous().numpy(), out.numpy()
     source, target, order = blocks.source.reshape(-1), blocks.target.reshape(-1), pairs.target.order.numpy()
     run_in_blocks(
-        lambda first, last: _multiply(x, w, start, source, target, order, blocks.count, y, first, last), len(blocks.count)
+        lambda first, last: _multiply(x, w, start, source, target, order, blocks.count, y, first, last),
+        len(blocks.count),
     )
     return out[:rows, :c_out].contiguous()
 
