@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 import torch
+from timing import shortest
 from torch import Tensor
 
 from beambox.geometry.grid import VoxelGrid
 from beambox.ops.ball_count import cpu as ball_count
 from beambox.ops.neighborhood import cpu as attention
 from beambox.ops.voxelize import cpu as voxelize
-
-
-def shortest(run: Callable[[], object], times: int = 10) -> float:
-    """Return the shortest of several times, in milliseconds; the first run is not counted."""
-    run()
-    taken = []
-    for _ in range(times):
-        start = time.perf_counter()
-        run()
-        taken.append(time.perf_counter() - start)
-    return min(taken) * 1e3
 
 
 def density_voxels(count: int, generator: torch.Generator) -> Tensor:
@@ -43,15 +30,15 @@ def main() -> None:
     image = torch.randn(1, 64, 188, 188, generator=generator, requires_grad=True)
     convolution = torch.nn.Conv2d(64, 64, 3, padding=1)
     with torch.no_grad():
-        plain = shortest(lambda: convolution(image))
-        ours = shortest(lambda: attention.neighborhood_attention(q, k, v, bias))
+        plain = 1e3 * shortest(lambda: convolution(image))
+        ours = 1e3 * shortest(lambda: attention.neighborhood_attention(q, k, v, bias))
     print(f"forward, 188 x 188 x 64:  convolution {plain:7.1f} ms, attention {ours:7.1f} ms, {ours / plain:.1f} times")
-    plain = shortest(lambda: convolution(image).sum().backward(), 5)
-    ours = shortest(lambda: attention.neighborhood_attention(q, k, v, bias).sum().backward(), 5)
+    plain = 1e3 * shortest(lambda: convolution(image).sum().backward(), 5)
+    ours = 1e3 * shortest(lambda: attention.neighborhood_attention(q, k, v, bias).sum().backward(), 5)
     print(f"and backward:             convolution {plain:7.1f} ms, attention {ours:7.1f} ms, {ours / plain:.1f} times")
     index = density_voxels(30_000, generator)
     for radius in (0.6, 1.8):
-        taken = shortest(lambda: ball_count.ball_count(index, (0.1, 0.1, 0.15), radius))  # noqa: B023
+        taken = 1e3 * shortest(lambda: ball_count.ball_count(index, (0.1, 0.1, 0.15), radius))  # noqa: B023
         print(f"ball_count, {len(index)} voxels, {radius} m: {taken:.1f} ms")
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 
 import torch
+from timing import shortest
 from torch import Tensor
 
 from beambox.ops.nms import cpu, reference
@@ -20,17 +19,6 @@ def candidates(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     boxes = boxes.repeat_interleave(32, dim=0)
     boxes += torch.randn(boxes.shape, generator=generator) * torch.tensor([0.5, 0.5, 0.1, 0.1, 0.05, 0.05, 0.2])
     return boxes, torch.rand(len(boxes), generator=generator)
-
-
-def shortest(run: Callable[[], object], times: int) -> float:
-    """Return the shortest of several times, in seconds; the first run is not counted."""
-    run()
-    taken = []
-    for _ in range(times):
-        start = time.perf_counter()
-        run()
-        taken.append(time.perf_counter() - start)
-    return min(taken)
 
 
 def main() -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
+from timing import shortest
 from torch import Tensor
 
 from beambox.geometry.grid import VoxelGrid
@@ -27,17 +26,6 @@ def sweep(count: int, generator: torch.Generator) -> Tensor:
     r, angle, z, intensity = torch.rand(4, count, generator=generator)
     r, angle = 2 + 68 * r**2, (angle - 0.5) * math.pi / 2
     return torch.stack((r * angle.cos(), r * angle.sin(), z * 3 - 2.5, intensity), dim=1)
-
-
-def shortest(run: Callable[[], object], times: int = 10) -> float:
-    """Return the shortest of several times, in seconds; the first run is not counted."""
-    run()
-    taken = []
-    for _ in range(times):
-        start = time.perf_counter()
-        run()
-        taken.append(time.perf_counter() - start)
-    return min(taken)
 
 
 def main() -> None:

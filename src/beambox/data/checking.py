@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError
+from beambox.data.road import height_and_slope
 from beambox.data.source import FrameSource
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.structures import Frame
@@ -154,9 +155,9 @@ class DataReport:
         else:
             self.without_points.append(frame.id)
         if frame.plane is not None:
-            a, b, c, d = frame.plane.tolist()
-            self.ground.append(-d / c)
-            self.slopes.append((-a / c, -b / c))
+            ground, slope = height_and_slope(frame.plane)
+            self.ground.append(ground)
+            self.slopes.append(slope)
         if frame.labels is None:
             self.unlabelled.append(frame.id)
             return

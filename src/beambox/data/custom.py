@@ -90,7 +90,7 @@ class CustomSource:
         frame = read_frame(path, fields=self.config.fields, intensity_scale=self.config.intensity_scale)
         points = frame.points.clone()
         points[:, :3] = points[:, :3] @ self.axes.matrix.T.to(points)
-        points[:, 2] = self.config.level(points[:, 2], points[:, 0], points[:, 1])
+        points[:, 2] += self.config.shift(points)
         labels = self.labels(index)
         if not self.whole:
             points, labels = self._crop(points, labels)
@@ -102,7 +102,7 @@ class CustomSource:
         if found is None:
             return None
         boxes = turn_boxes(torch.from_numpy(found.boxes), self.axes.matrix)
-        boxes[:, 2] = self.config.level(boxes[:, 2], boxes[:, 0], boxes[:, 1])
+        boxes[:, 2] += self.config.shift(boxes)
         boxes[:, 6] = wrap_angle(boxes[:, 6])
         names = [self.config.class_of(name, place) for name, place in zip(found.names, found.places)]
         keep = [k for k, name in enumerate(names) if name is not None]

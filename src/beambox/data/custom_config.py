@@ -12,7 +12,7 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.files import read_text
-from beambox.geometry.axes import Axes
+from beambox.geometry.axes import Axes, level_shift
 
 __all__ = ["KITTI_GROUND", "CustomConfig", "GroundSlope", "read_custom_config"]
 
@@ -131,9 +131,9 @@ class CustomConfig(BaseModel):
         """Metres added to z, after the axes have been turned."""
         return 0.0 if self.sensor_height is None else self.sensor_height + KITTI_GROUND
 
-    def level(self, z: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Return z shifted to KITTI's height and with the ground's slope taken away; axes have been turned."""
-        return z + (self.raise_by - self.ground_slope.forward * x - self.ground_slope.left * y)
+    def shift(self, rows: Tensor) -> Tensor:
+        """Metres added to z of points or boxes whose axes have been turned, ``(N,)``: KITTI's height, level ground."""
+        return level_shift(rows, self.raise_by, (self.ground_slope.forward, self.ground_slope.left))
 
     def class_of(self, name: str, where: str) -> str | None:
         """Return the class wanted for a name in the files, or None to leave it out.

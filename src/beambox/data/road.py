@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["fit_road_plane"]
+__all__ = ["fit_road_plane", "height_and_slope"]
 
 CELL = 2.0
 """Edge of the cells whose lowest points stand for the ground, metres."""
@@ -56,6 +56,12 @@ def fit_road_plane(points: Tensor) -> Tensor | None:
     slope_x, slope_y, height = _robust_fit(design, z)
     normal = np.array([-slope_x, -slope_y, 1.0, -height]) / np.sqrt(slope_x**2 + slope_y**2 + 1)
     return torch.from_numpy(normal.astype(np.float32))
+
+
+def height_and_slope(plane: Tensor) -> tuple[float, tuple[float, float]]:
+    """Return z of a plane (a, b, c, d) under the origin, and the metres it rises a metre along x and along y."""
+    a, b, c, d = plane.tolist()
+    return -d / c, (-a / c, -b / c)
 
 
 def _robust_fit(design: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
 
-__all__ = ["Axes", "turn_boxes"]
+__all__ = ["Axes", "level_shift", "turn_boxes"]
 
 # direction -> (row of the LiDAR frame x forward, y left, z up; sign)
 _DIRECTIONS = {
@@ -91,6 +91,17 @@ class Axes:
 
     def __str__(self) -> str:
         return f"x: {self.x}, y: {self.y}, z: {self.z}"
+
+
+def level_shift(rows: Tensor, raise_by: float, slope: tuple[float, float]) -> Tensor:
+    """Return ``(N,)`` metres that bring z of points or boxes to another height and level the ground under them.
+
+    Args:
+        rows: ``(N, 2 or more)`` x forward, y left, in metres.
+        raise_by: metres to add everywhere.
+        slope: metres that the ground rises a metre forward and a metre to the left; taken away.
+    """
+    return raise_by - slope[0] * rows[:, 0] - slope[1] * rows[:, 1]
 
 
 def turn_boxes(boxes: Tensor, matrix: Tensor) -> Tensor:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from beambox.geometry.axes import Axes, turn_boxes
+from beambox.geometry.axes import Axes, level_shift, turn_boxes
 from beambox.structures import Detections, Frame
 
-__all__ = ["Axes", "Corrections"]
+__all__ = ["Corrections"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,6 @@ class Corrections:
     """Where the axes of the points lead."""
     raise_by: float = 0.0
     """Metres added to z: this sensor's height above the ground less that of the training data's."""
-
     slope: tuple[float, float] = (0.0, 0.0)
     """Metres that the ground rises a metre forward and a metre to the left; taken away from z."""
 
@@ -57,4 +56,4 @@ class Corrections:
 
     def _shift(self, rows: Tensor) -> Tensor:
         """Metres added to z of points or boxes whose axes have been turned: ``(N,)``."""
-        return self.raise_by - self.slope[0] * rows[:, 0] - self.slope[1] * rows[:, 1]
+        return level_shift(rows, self.raise_by, self.slope)

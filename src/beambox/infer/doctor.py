@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from beambox.data.reading import read_frame
-from beambox.data.road import fit_road_plane
+from beambox.data.road import fit_road_plane, height_and_slope
 from beambox.geometry.axes import Axes
 from beambox.infer.corrections import Corrections
 from beambox.infer.trained import Trained
@@ -78,11 +78,12 @@ def examine(path: Path | str, trained: Trained, fields: str | Sequence[str] | No
     findings += [_units(frame.points)]
     axes_finding, axes = _axes(frame.points)
     turned = Corrections(axes).apply(frame).points
-    height_finding, raised = _height(turned, trained)
+    plane = fit_road_plane(turned)
+    height_finding, raised = _height(plane, trained)
     fixed = turned.clone()
     fixed[:, 2] += raised
     bright_finding, scale = _intensity(frame, path, trained, fields)
-    findings += [axes_finding, height_finding, _slope(turned)]
+    findings += [axes_finding, height_finding, _slope(plane)]
     findings += [_range(turned, fixed, trained), _density(fixed, trained), bright_finding]
     kept = tuple(finding for finding in findings if finding is not None)
     return Diagnosis(kept, Corrections(axes, raised), scale)
@@ -172,12 +173,11 @@ def _sector(points: Tensor) -> tuple[float, float] | None:
     return float((start + width / 2 + 180) % 360 - 180), float(width)
 
 
-def _height(points: Tensor, trained: Trained) -> tuple[Finding, float]:
-    plane = fit_road_plane(points)
+def _height(plane: Tensor | None, trained: Trained) -> tuple[Finding, float]:
     if plane is None:
         return Finding("height", "note", "too few points near the sensor to find the ground"), 0.0
-    a, b, c, d = plane.tolist()
-    height, tilt = d / c, math.degrees(math.atan2(math.hypot(a, b), c))
+    ground, slope = height_and_slope(plane)
+    height, tilt = -ground, math.degrees(math.atan(math.hypot(*slope)))
     text = f"the ground lies {height:.2f} m below z = 0, in training {trained.sensor_height:.2f} m"
     if tilt > 6:
         return Finding("height", "note", f"{text}, but it is tilted by {tilt:.0f} degrees: level the points first"), 0.0
@@ -187,13 +187,11 @@ def _height(points: Tensor, trained: Trained) -> tuple[Finding, float]:
     return Finding("height", "bad", text, option), round(height, 2) - trained.sensor_height
 
 
-def _slope(points: Tensor) -> Finding | None:
+def _slope(plane: Tensor | None) -> Finding | None:
     """Tell of a ground that leans: one sweep cannot say whether the road does so or the sensor, so this is a note."""
-    plane = fit_road_plane(points)
     if plane is None:
         return None
-    a, b, c, _ = plane.tolist()
-    forward, left = round(-a / c, 3) + 0.0, round(-b / c, 3) + 0.0
+    forward, left = (round(rise, 3) + 0.0 for rise in height_and_slope(plane)[1])
     if not STEEP < math.hypot(forward, left) < math.tan(math.radians(6)):
         return None
     return Finding(

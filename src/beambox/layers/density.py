@@ -10,15 +10,15 @@ import torch
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError
-from beambox.layers.sparse import SparseBlock, sparse_block
+from beambox.layers.sparse import levels_left, sparse_block
 from beambox.ops.ball_count import ball_count
+from beambox.ops.ball_count.reference import TOLERANCE
 from beambox.ops.sparse_conv import Sites, SparseTensor, linear_keys
 from beambox.ops.voxelize import Voxels
 
 __all__ = ["CountSet", "DensityBranch", "Normalisation", "count_points", "normalised", "patch_cells"]
 
 VOXELS_AT_ONCE = 256  # bounds the memory of the distances to points
-TOLERANCE = 1e-6  # square metres; what lies at the radius counts, as in ops.ball_count
 
 
 class CountSet(str, Enum):
@@ -139,11 +139,7 @@ class DensityBranch(nn.Module):
 
     def bev_channels(self, levels: int) -> int:
         """Return the map's channels for a grid of so many height levels: those left times ``depth``."""
-        shape = (levels + 1, 64, 64)
-        for block in self.layers:
-            assert isinstance(block, SparseBlock)
-            shape = block.conv.geometry.output_shape(shape)
-        return self.depth * shape[0]
+        return self.depth * levels_left(self.layers, levels + 1)
 
     def forward(self, sites: Sites, voxels: Voxels) -> Tensor:
         """Return the density map ``(B, depth * Z / 8, Y / 8, X / 8)``.

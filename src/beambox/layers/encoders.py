@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from beambox.layers.sparse import SparseBlock, sparse_block, submanifold_block
+from beambox.layers.sparse import levels_left, sparse_block, submanifold_block
 from beambox.ops.scatter import segment_mean
 from beambox.ops.sparse_conv import SparseTensor
 from beambox.ops.voxelize import Voxels
@@ -85,11 +85,8 @@ class VoxelEncoder(nn.Module):
         Raises:
             BeamboxError: for a grid too flat to be halved four times.
         """
-        shape = (levels + 1, 64, 64)
-        for block in (self.stage2[0], self.stage3[0], self.stage4[0], self.out):
-            assert isinstance(block, SparseBlock)
-            shape = block.conv.geometry.output_shape(shape)
-        return self.out_channels * shape[0]
+        strided = (self.stage2[0], self.stage3[0], self.stage4[0], self.out)
+        return self.out_channels * levels_left(strided, levels + 1)
 
     def forward(self, voxels: SparseTensor) -> EncoderStages:
         """Encode ``(V, in_channels)`` voxel features."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +19,15 @@ from beambox.ops.sparse_conv import (
     submanifold_conv3d,
 )
 
-__all__ = ["InverseConv3d", "SparseBlock", "SparseConv3d", "SubmanifoldConv3d", "sparse_block", "submanifold_block"]
+__all__ = [
+    "InverseConv3d",
+    "SparseBlock",
+    "SparseConv3d",
+    "SubmanifoldConv3d",
+    "levels_left",
+    "sparse_block",
+    "submanifold_block",
+]
 
 BN_EPS = 1e-3
 BN_MOMENTUM = 0.01
@@ -153,3 +162,16 @@ def sparse_block(
 ) -> SparseBlock:
     """Strided sparse convolution without bias, batch norm (eps 1e-3, momentum 0.01), ReLU."""
     return SparseBlock(SparseConv3d(in_channels, channels, kernel, stride, padding, bias=False))
+
+
+def levels_left(blocks: Iterable[nn.Module], levels: int) -> int:
+    """Return how many height levels strided sparse blocks leave of so many.
+
+    Raises:
+        BeamboxError: where one has less height than its kernel needs.
+    """
+    shape = (levels, 64, 64)
+    for block in blocks:
+        assert isinstance(block, SparseBlock)
+        shape = block.conv.geometry.output_shape(shape)
+    return shape[0]

@@ -77,9 +77,8 @@ class OnceFiles:
     def write_splits(self) -> None:
         """List the sequences that are whole; which of them are for validation depends on their number alone."""
         names = sorted(path.parent.name for path in (Path(self.out) / "data").glob("*/*.json"))
-        val = [name for name in names if self._validates(int(name))]
-        write_once_split(self.out, "train", [name for name in names if name not in val])
-        write_once_split(self.out, "val", val)
+        write_once_split(self.out, "train", [name for name in names if not self._validates(int(name))])
+        write_once_split(self.out, "val", [name for name in names if self._validates(int(name))])
 
     def _validates(self, sequence: int) -> bool:
         """Spread validation evenly over the sequences, beginning with the second."""
