@@ -96,6 +96,20 @@ def test_car_bus_and_truck_match_each_other_only_when_merged() -> None:
     assert evaluate([(labels, other)], five_classes=True).to_json()["Car"]["overall"] == 0
 
 
+def test_classes_that_a_detector_does_not_know_are_not_scored() -> None:
+    names = ("Car", "Truck", "Pedestrian")
+    boxes = torch.tensor([[5.0 + 6 * k, 0, 0, 2, 1, 1, 0] for k in range(3)])
+    labels = Labels(boxes, names)
+    found = Detections(boxes[:1], torch.ones(1), torch.zeros(1, dtype=torch.int64), ("Car",), "")
+    everything = evaluate([(labels, found)])
+    assert everything.classes == ("Vehicle", "Pedestrian", "Cyclist") and "mean" in everything.to_json()
+    cars = evaluate([(labels, found)], known=["Car"])
+    assert cars.classes == ("Vehicle",) and cars.ap[0] == everything.ap[0], "trucks count as vehicles all the same"
+    assert set(cars.to_json()) == {"Vehicle"}, "the mean of a part is not the benchmark's"
+    with pytest.raises(BeamboxError, match="the detector knows Van"):
+        evaluate([(labels, found)], known=["Van"])
+
+
 def test_opposed_headings_and_far_centres_do_not_overlap() -> None:
     box = np.array([[10.0, 0, -1, 4, 2, 1.5, 3.1]])
     assert gated_overlap(box, box)[0, 0] == pytest.approx(1)

@@ -10,11 +10,14 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
+from beambox.detectors.catalogue import build
 from beambox.detectors.weights import read_weights
+from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.metrics.once_result import OnceResult
 from beambox.simulate import Sensor, write_dataset
 from beambox.train.config import Recipe, ValidationSection, parse_recipe, read_recipe
 from beambox.train.loop import train
+from beambox.train.sources import open_source
 from beambox.train.validate import Validator, summarise_once
 from oracles.command_line import beambox
 from oracles.paths import ROOT
@@ -61,6 +64,14 @@ def test_run_on_simulated_once_data_is_validated_and_evaluated_by_its_rules(
     assert ran.status == 0
     assert "ONCE AP in percent, 2 frames" in ran.out
     assert json.loads((tmp_path / "ap.json").read_text()) == card["validation"]
+
+
+def test_classes_of_the_detector_alone_are_scored_and_choose(data: Path) -> None:
+    cars = build("pointpillars", {**OPTIONS, "grid": GRID, "anchors": KITTI_ANCHORS[:1]})
+    score = Validator(recipe(choose_by="Vehicle").validation, open_source(recipe().validation.source, data))(cars)
+    assert set(score.scalars) == {"Vehicle", "mean"} and set(score.table) == {"Vehicle"}
+    with pytest.raises(BeamboxError, match='the detector has no class "Cyclist"'):
+        Validator(recipe(choose_by="Cyclist").validation, open_source(recipe().validation.source, data))(cars)
 
 
 def test_the_wanted_class_at_all_distances_chooses() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -119,9 +119,12 @@ def score_frames(
     return evaluate(frames, classes, min_overlap=iou, no_difficulty=not graded)
 
 
-def score_once(frames: Sequence[KittiFrame], iou: Mapping[str, float] | None = None) -> OnceResult:
-    """Score frames by ONCE's rules; arguments as in :func:`score_frames`."""
-    return once.evaluate([(frame.labels, frame.detections) for frame in frames], min_overlap=iou)
+def score_once(
+    frames: Sequence[KittiFrame], iou: Mapping[str, float] | None = None, known: Collection[str] | None = None
+) -> OnceResult:
+    """Score frames by ONCE's rules; arguments as in :func:`beambox.metrics.once.evaluate`."""
+    pairs = [(frame.labels, frame.detections) for frame in frames]
+    return once.evaluate(pairs, min_overlap=iou, known=known)
 
 
 def write_results(folder: Path, frames: Sequence[KittiFrame]) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,6 +74,7 @@ def evaluate(
     five_classes: bool = False,
     min_overlap: Mapping[str, float] | None = None,
     true_rotation: bool = False,
+    known: Collection[str] | None = None,
 ) -> OnceResult:
     """Score detections in memory.
 
@@ -82,9 +83,10 @@ def evaluate(
         five_classes: score the labels' own classes instead of merging Car, Bus and Truck into Vehicle.
         min_overlap: other IoU thresholds, by class.
         true_rotation: turn boxes counter-clockwise; the numbers then no longer compare with published ones.
+        known: the classes that a detector knows, by the labels' names; others are not scored. All by default.
 
     Raises:
-        BeamboxError: if there is no frame or a threshold is given for a class that is not scored.
+        BeamboxError: if there is no frame, a threshold is given for a class that is not scored, or none is known.
     """
     pairs = []
     for labels, found in frames:
@@ -94,7 +96,9 @@ def evaluate(
         truth = OnceBoxes(labels.names, truth_boxes.numpy(), np.zeros(len(labels)))
         scores = found.scores.detach().cpu().double().numpy()
         pairs.append((truth, OnceBoxes(tuple(found.names), boxes.numpy(), scores)))
-    return evaluate_boxes(pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation)
+    return evaluate_boxes(
+        pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation, known=known
+    )
 
 
 def evaluate_annotations(
@@ -148,12 +152,21 @@ def evaluate_boxes(
     five_classes: bool = False,
     min_overlap: Mapping[str, float] | None = None,
     true_rotation: bool = False,
+    known: Collection[str] | None = None,
 ) -> OnceResult:
     """Score boxes; arguments as in :func:`evaluate`, with (ground truth, predictions) of each frame."""
     if not pairs:
         raise BeamboxError("there is nothing to score: no frame was given")
     minima = _thresholds(FIVE_CLASSES if five_classes else SUPERCLASSES, min_overlap or {})
     merge = {} if five_classes else SUPERCLASS_OF
+    all_classes = len(minima)
+    if known is not None:
+        learned = {merge.get(name, name) for name in known}
+        minima = {name: minimum for name, minimum in minima.items() if name in learned}
+        if not minima:
+            raise BeamboxError(
+                f"ONCE's metric scores {', '.join(FIVE_CLASSES)}; the detector knows {', '.join(known) or 'no class'}"
+            )
     truth_name = np.array([merge.get(name, name) for truth, _ in pairs for name in truth.names], dtype=np.str_)
     found_name = np.array([merge.get(name, name) for _, found in pairs for name in found.names], dtype=np.str_)
     truth_range, found_range = (
@@ -185,7 +198,8 @@ def evaluate_boxes(
         ]
         values.append(tuple(_average_precision(table) for table in tables))
         objects.append(tuple(table.objects for table in tables))
-    return OnceResult(tuple(minima), tuple(minima.values()), tuple(values), tuple(objects), len(pairs))
+    whole = len(minima) == all_classes
+    return OnceResult(tuple(minima), tuple(minima.values()), tuple(values), tuple(objects), len(pairs), whole)
 
 
 def gated_overlap(truth: Floats, found: Floats, true_rotation: bool = False) -> Floats:

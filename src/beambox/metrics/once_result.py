@@ -25,14 +25,16 @@ class OnceResult:
     """Number of ground-truth boxes that count, likewise."""
     frames: int
     """Number of frames scored."""
+    whole: bool = True
+    """Whether all the benchmark's classes were scored, so that the mean is its mAP."""
 
     def mean(self) -> tuple[float, ...]:
-        """Return the plain mean over the classes, one value a band; the first is the benchmark's mAP."""
+        """Return the plain mean over the classes scored, one value a band; of all classes the first is the mAP."""
         return tuple(sum(column) / len(column) for column in zip(*self.ap))
 
     def to_json(self) -> dict[str, dict[str, float]]:
-        """Return numbers ready for ``json.dump``, in percent."""
-        rows = [*zip(self.classes, self.ap), ("mean", self.mean())]
+        """Return numbers ready for ``json.dump``, in percent; the mean only where it is that of all classes."""
+        rows = [*zip(self.classes, self.ap), *([("mean", self.mean())] if self.whole else [])]
         return {name: dict(zip(BANDS, (round(value, 4) for value in row))) for name, row in rows}
 
     def table(self, name: str = "this result", published: bool = False) -> str:

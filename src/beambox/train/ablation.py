@@ -16,12 +16,13 @@ from typing import Any
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
 from beambox.detectors.weights import load_weights, write_atomically
-from beambox.infer.evaluate import Detect, detect_frames, network, score_frames, score_once, scored_frames
+from beambox.infer.evaluate import Detect, detect_frames, network, scored_frames
 from beambox.structures import Detections, Frame
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.loop import FINAL, LAST, train
 from beambox.train.sources import open_source, shared_database
 from beambox.train.tables import Table
+from beambox.train.validate import score_by
 
 __all__ = ["Interrupted", "Measured", "report", "run_table", "to_json"]
 
@@ -152,11 +153,7 @@ def score(model: Any, source: FrameSource, recipe: Recipe) -> dict[str, Any]:
     model = model.to("cuda" if torch.cuda.is_available() else "cpu")
     timed = Timed(network(model))
     frames = scored_frames(detect_frames(timed, source))
-    section = recipe.validation
-    if section.source.kind == "once":
-        result = score_once(frames, section.iou or None)
-    else:
-        result = score_frames(frames, model.config.classes, section.iou or None, section.level != "all")
+    result = score_by(recipe.validation, frames, model.config.classes)
     return {**result.to_json(), "time": {"ms": timed.median()}}
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.source import FrameSource
 from beambox.infer.evaluate import detect_frames, network, score_frames, score_once, scored_frames
+from beambox.metrics.kitti import KittiFrame
 from beambox.metrics.kitti_result import KittiResult
+from beambox.metrics.once import SUPERCLASS_OF
 from beambox.metrics.once_result import OnceResult
 from beambox.train.config import ValidationSection
 
-__all__ = ["Score", "Validator", "summarise", "summarise_once"]
+__all__ = ["Score", "Validator", "score_by", "summarise", "summarise_once"]
 
 
 @dataclass(frozen=True)
@@ -38,19 +41,25 @@ class Validator:
 
     def __call__(self, model: Any) -> Score:
         """Score a detector; its training mode is restored."""
-        if self.section.source.kind == "once":
-            frames = scored_frames(detect_frames(network(model), self.source))
-            return summarise_once(score_once(frames, self.section.iou or None), self.section)
-        classes = model.config.classes
-        if self.section.choose_by != "mean" and self.section.choose_by not in classes:
+        section, classes = self.section, model.config.classes
+        merge = SUPERCLASS_OF if section.source.kind == "once" else {}
+        choices = [*dict.fromkeys(merge.get(name, name) for name in classes), "mean"]
+        if section.choose_by not in choices:
             raise BeamboxError(
-                f'validation.choose_by: the detector has no class "{self.section.choose_by}"'
-                f"{did_you_mean(self.section.choose_by, [*classes, 'mean'])}"
+                f'validation.choose_by: the detector has no class "{section.choose_by}"'
+                f"{did_you_mean(section.choose_by, choices)}"
             )
-        frames = scored_frames(detect_frames(network(model), self.source))
-        return summarise(
-            score_frames(frames, classes, self.section.iou or None, self.section.level != "all"), self.section
-        )
+        result = score_by(section, scored_frames(detect_frames(network(model), self.source)), classes)
+        return summarise_once(result, section) if isinstance(result, OnceResult) else summarise(result, section)
+
+
+def score_by(
+    section: ValidationSection, frames: Sequence[KittiFrame], classes: Sequence[str]
+) -> KittiResult | OnceResult:
+    """Score the classes that a detector knows by the rules of a recipe's validation: ONCE's for ONCE, else KITTI's."""
+    if section.source.kind == "once":
+        return score_once(frames, section.iou or None, classes)
+    return score_frames(frames, classes, section.iou or None, section.level != "all")
 
 
 def summarise(result: KittiResult, section: ValidationSection) -> Score:
