@@ -33,11 +33,13 @@ def test_show_draws_a_sweep_without_any_model(capsys: Capture, scan: Path, tmp_p
     assert Image.open(tmp_path / "a.png").size == (1450, 1200)
 
 
+@pytest.mark.parametrize("corrections", [(), ("--ground-slope", "0.02,-0.04", "--sensor-height", "1.5")])
 def test_show_draws_detections_of_a_model_and_of_a_folder_alike(
-    capsys: Capture, weights: Path, scan: Path, tmp_path: Path
+    capsys: Capture, weights: Path, scan: Path, tmp_path: Path, corrections: tuple[str, ...]
 ) -> None:
-    assert beambox(capsys, "detect", scan, "-m", weights, "-o", tmp_path / "found").status == 0
-    now = beambox(capsys, "show", scan, "-m", weights, "-o", tmp_path / "now.png", "--area", "0,-16,32,16")
+    assert beambox(capsys, "detect", scan, "-m", weights, "-o", tmp_path / "found", *corrections).status == 0
+    now = beambox(capsys, "show", scan, "-m", weights, "-o", tmp_path / "now.png", "--area", "0,-16,32,16",
+                  *corrections)  # fmt: skip
     then = beambox(capsys, "show", scan, "--results", tmp_path / "found", "-o", tmp_path / "then.png",
                    "--area", "0,-16,32,16")  # fmt: skip
     assert now.status == then.status == 0, now.err + then.err

@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from beambox.checks import BeamboxError, MissingFileError
 from beambox.detectors import weights
 from beambox.detectors.catalogue import build, config_from_dict, config_to_dict
 from beambox.detectors.pointpillars import PointPillarsConfig
+from beambox.detectors.voxel_rcnn import VoxelRcnnConfig
 from beambox.detectors.weights import fill, load_weights, read_weights, save_weights
 
 OPTIONS = {"widths": [8, 8, 8], "up_widths": [8, 8, 8], "pillar_channels": 8, "depths": [0, 0, 0]}
@@ -87,6 +89,13 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path: Path, monkeypatch: pyte
 def test_configurations_survive_plain_values() -> None:
     config = PointPillarsConfig(widths=(1, 2, 3), centred_anchors=True)
     assert config_from_dict(PointPillarsConfig, config_to_dict(config)) == config
+
+
+def test_settings_given_in_part_keep_the_defaults_of_the_detector() -> None:
+    config = config_from_dict(VoxelRcnnConfig, {"post": {"score_threshold": 0.2}, "sampling": {"per_sample": 8}})
+    assert config.post == replace(VoxelRcnnConfig().post, score_threshold=0.2)  # of its kind alone: overlap up to 0.01
+    assert config.post.nms_iou == 0.1
+    assert config.sampling == replace(VoxelRcnnConfig().sampling, per_sample=8)
 
 
 @pytest.mark.parametrize(

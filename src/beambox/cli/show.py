@@ -41,6 +41,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     view: options.ViewOption = "auto",
     sensor_height: options.HeightOption = None,
     axes: options.AxesOption = "",
+    ground_slope: options.SlopeOption = "",
     intensity_scale: options.IntensityOption = None,
     fields: options.FieldsOption = "",
     device: options.DeviceOption = "auto",
@@ -79,6 +80,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
             view=view,  # pyright: ignore[reportArgumentType]  # load checks it
             sensor_height=sensor_height,
             axes=turned,
+            ground_slope=options.parse_slope(ground_slope),
             intensity_scale=intensity_scale,
             fields=fields or None,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -73,25 +73,26 @@ def config_to_dict(config: Any) -> dict[str, Any]:
 
 
 def config_from_dict(config_type: type, options: Mapping[str, Any]) -> Any:
-    """Turn plain values into a checked configuration.
+    """Turn plain values into a checked configuration; what they leave out, at any depth, is as in ``config_type()``.
 
     Raises:
         BeamboxError: naming the field, with the nearest known one where it does not exist.
     """
-    _refuse_unknown(config_type, options, "")
+    complete = _completed(options, config_to_dict(config_type()), config_type.__name__)
     try:
-        return TypeAdapter(config_type).validate_python(dict(options))
+        return TypeAdapter(config_type).validate_python(complete)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise BeamboxError(f"`{where}`: {first['msg']}, got {first['input']!r}") from None
 
 
-def _refuse_unknown(config_type: type, options: Mapping[str, Any], prefix: str) -> None:
-    known = {f.name: f for f in fields(config_type)}
+def _completed(options: Mapping[str, Any], defaults: Mapping[str, Any], owner: str, prefix: str = "") -> dict[str, Any]:
+    """Fill settings that are given in part from the defaults of this detector, not from those of the setting's type."""
+    complete = dict(defaults)
     for key, value in options.items():
-        if key not in known:
-            raise BeamboxError(f'{config_type.__name__} has no field "{prefix}{key}"{did_you_mean(key, known)}')
-        default = known[key].default_factory if callable(known[key].default_factory) else type(known[key].default)
-        if isinstance(value, Mapping) and isinstance(default, type) and is_dataclass(default):
-            _refuse_unknown(default, value, f"{prefix}{key}.")
+        if key not in defaults:
+            raise BeamboxError(f'{owner} has no field "{prefix}{key}"{did_you_mean(key, defaults)}')
+        nested = isinstance(value, Mapping) and isinstance(defaults[key], Mapping)
+        complete[key] = _completed(value, defaults[key], owner, f"{prefix}{key}.") if nested else value
+    return complete
