@@ -127,6 +127,8 @@ def test_sweeps_without_points_give_predictions_a_loss_and_no_error(name: str, t
     losses = model.loss(predictions, [Labels.empty()] * count)
     assert all(bool(loss.isfinite()) for loss in losses.values())
     total(losses).backward()
+    gradients = {key: parameter.grad for key, parameter in model.named_parameters()}
+    assert [key for key, grad in gradients.items() if grad is None] == [], "DDP waits for every parameter"
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -48,6 +48,15 @@ def test_voxel_query_of_nothing(backend):
     assert voxel_query(points[:0], cells[:0], sites, centres, (1, 1, 1), 1.0, 4).shape == (0, 4)
 
 
+def test_voxel_query_far_outside_finds_nothing(backend):
+    """A point that is NaN or infinite has the smallest or the largest integer as its cell."""
+    points, _, sites, centres = scene(4, 1.0, count=7)
+    least, most = torch.iinfo(torch.int64).min, torch.iinfo(torch.int64).max
+    cells = torch.tensor([[b, z, y, x] for b in (0, 1) for z, y, x in ((least,) * 3, (most,) * 3, (2, least, most))])
+    cells = torch.cat((cells, torch.tensor([[most, 2, 2, 2]])))
+    assert voxel_query(points, cells, sites, centres, (2, 2, 2), 100.0, 4).eq(-1).all()
+
+
 def test_voxel_query_refuses_what_makes_no_sense():
     points, cells, sites, centres = scene(3, 0.3)
     with pytest.raises(BeamboxError, match="positive radius and at least 1 sample"):

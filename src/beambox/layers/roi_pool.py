@@ -64,7 +64,8 @@ class _Gather(nn.Module):
         features = _normed(self.feature(cell_features.features.to(points.dtype)), self.feature_norm)  # (V, C)
         row = found.clamp(min=0)
         if len(features) == 0:
-            features, centres = features.new_zeros((1, level.channels)), centres.new_zeros((1, 3))
+            # the sum of no rows is zero and keeps every parameter in the graph, as processes in step need
+            features, centres = features.sum(dim=0, keepdim=True), centres.new_zeros((1, 3))
         gathered = torch.where(none[..., None], 0.0, features[row])  # (M, S, C)
         away = torch.where(none[..., None], 0.0, centres[row] - points[:, None])  # (M, S, 3)
         position = _normed(self.offset(away).flatten(0, 1), self.offset_norm).unflatten(0, found.shape)

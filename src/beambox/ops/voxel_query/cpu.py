@@ -43,6 +43,11 @@ def _search(points, cells, centres, lines, column, order, extent, reach, limit, 
         b, z, y, x = cells[i]
         if b < 0 or b >= extent[0]:
             continue
+        # out of reach of the grid; the indices may be any, so nothing may be added to them before this is known
+        if z < -reach[0] or y < -reach[1] or x < -reach[2]:
+            continue
+        if z - extent[1] >= reach[0] or y - extent[2] >= reach[1] or x - extent[3] >= reach[2]:
+            continue
         n = 0
         for cz in range(max(0, z - reach[0]), min(extent[1], z + reach[0] + 1)):
             for cy in range(max(0, y - reach[1]), min(extent[2], y + reach[1] + 1)):
