@@ -69,6 +69,19 @@ def test_draws_walk_through_all_objects() -> None:
         base.draw("Cars", 1, 0, 0)
 
 
+def test_whatever_is_present_no_object_comes_twice_in_a_pass() -> None:
+    boxes = np.zeros((24, 7), np.float32)
+    boxes[:, 0], boxes[:, 3:6] = np.arange(24) * 10, 1  # far apart
+    base = ObjectDatabase(
+        boxes, np.zeros((24, 4), np.float32), np.arange(25), np.zeros(24, np.int64), ("Car",), ("",) * 24
+    )
+    nothing, cars = np.zeros((0, 7), np.float32), [("Car", 6)]
+    drawn = [base.sample(nothing, cars, turn, 0, {"Car": here})[0] for turn, here in enumerate((0, 3, 4, 9))]
+    assert [len(some) for some in drawn] == [6, 3, 2, 0]
+    assert len(set(np.concatenate(drawn).tolist())) == 11
+    assert base.sample(nothing, cars, 1, 0, {"Van": 5})[0].tolist() == base.sample(nothing, cars, 1, 0)[0].tolist()
+
+
 def test_of_two_colliding_candidates_both_go() -> None:
     boxes = np.array([[5, 0, 0, 4, 2, 1.5, 0], [6, 1, 0, 4, 2, 1.5, 0], [20, 0, 0, 4, 2, 1.5, 0]], dtype=np.float32)
     base = ObjectDatabase(

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 from typing import Annotated
 
@@ -123,12 +124,9 @@ def sample_objects(frame: Frame, config: AugmentConfig, database: ObjectDatabase
     one is fitted; where none can be fitted the objects keep their height.
     """
     labels = _labels(frame)
-    wanted = [
-        (name, max(0, count - labels.names.count(name)) if config.sample_whole_scene else count)
-        for name, count in config.sample.items()
-    ]
+    present = Counter(labels.names) if config.sample_whole_scene else None
     scene_boxes = labels.boxes.numpy()
-    objects, names = database.sample(scene_boxes, wanted, turn, seed)
+    objects, names = database.sample(scene_boxes, list(config.sample.items()), turn, seed, present)
     if len(objects) == 0:
         return frame
     boxes = database.boxes[objects]  # (K, 7), a copy

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -164,7 +164,7 @@ class ObjectDatabase:
             frames=tuple(name for database in databases for name in database.frames),
         )
 
-    def draw(self, name: str, count: int, turn: int, seed: int) -> np.ndarray:
+    def draw(self, name: str, count: int, turn: int, seed: int, needed: int | None = None) -> np.ndarray:
         """Return the objects that the ``turn``-th draw of ``count`` takes: a shuffled walk, each once a pass.
 
         Args:
@@ -172,6 +172,7 @@ class ObjectDatabase:
             count: how many; fewer come where the class has fewer.
             turn: number of the draw, 0 for the first of a run; a pure function of it and the seed.
             seed: names the walk.
+            needed: take only the first so many of them and pass over the others.
 
         Returns:
             ``(count or fewer,)`` int64 numbers of objects.
@@ -183,10 +184,16 @@ class ObjectDatabase:
         count = min(count, len(members))
         if count == 0:
             return np.zeros(0, dtype=np.int64)
-        return np.unique(members[walk(len(members), turn * count, count, (seed, OBJECTS, kind))])
+        steps = walk(len(members), turn * count, count, (seed, OBJECTS, kind))
+        return np.unique(members[steps[:needed]])
 
     def sample(
-        self, existing: np.ndarray, wanted: Sequence[tuple[str, int]], turn: int, seed: int
+        self,
+        existing: np.ndarray,
+        wanted: Sequence[tuple[str, int]],
+        turn: int,
+        seed: int,
+        present: Mapping[str, int] | None = None,
     ) -> tuple[np.ndarray, list[str]]:
         """Draw objects that stand free: classes in turn, colliding candidates left out (both, where two collide).
 
@@ -195,6 +202,7 @@ class ObjectDatabase:
             wanted: (class, count) in the order of drawing.
             turn: number of the draw; see :meth:`draw`.
             seed: names the walk.
+            present: by class, how many of the count need not be drawn; none where a class is missing.
 
         Returns:
             ``(K,)`` int64 numbers of the accepted objects and their class names.
@@ -202,7 +210,7 @@ class ObjectDatabase:
         taken: list[np.ndarray] = []
         names: list[str] = []
         for name, count in wanted:
-            drawn = self.draw(name, count, turn, seed)
+            drawn = self.draw(name, count, turn, seed, max(0, count - (present or {}).get(name, 0)))
             candidates = self.boxes[drawn]  # (n, 7)
             among = overlap_bev(candidates[:, None], candidates)  # (n, n)
             np.fill_diagonal(among, False)
