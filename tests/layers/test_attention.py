@@ -13,6 +13,7 @@ from beambox.layers.attention import (
     Gate,
     HeightChannelFusion,
     HeightChannelKind,
+    one_stack_a_voxel,
     pillar_stacks,
     pseudo_images,
 )
@@ -115,6 +116,19 @@ def test_stacks_hold_each_voxel_at_its_height() -> None:
     for row, (b, z, y, x) in zip(features, voxels.index.tolist()):
         torch.testing.assert_close(stacks[place[b, y, x], z], row)
     assert int((stacks != 0).sum()) == features.numel()
+
+
+@pytest.mark.parametrize("count", [0, 1, 25])
+def test_one_stack_a_voxel_makes_the_same_image(count: int) -> None:
+    voxels = some_voxels(count, 4, 2, 3)
+    features = features_of(voxels, 5, 0, torch.float32)
+    module = fusion(5, 4, HeightChannelKind.BOTH, 0, torch.float32)
+    images = []
+    for stacked in (pillar_stacks, one_stack_a_voxel):
+        stacks, index = stacked(features, voxels)
+        images.append(scatter_bev(module(stacks), index, 2, (3, 4)))
+    assert len(stacks) == len(voxels)
+    torch.testing.assert_close(images[1], images[0], atol=1e-6, rtol=0)
 
 
 def test_a_slice_that_is_not_there_is_refused() -> None:

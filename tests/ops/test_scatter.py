@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.ops.scatter import cpu, reference, scatter_bev, segment_max, segment_mean, segment_sum
+from beambox.ops.scatter import cpu, graph, reference, scatter_bev, segment_max, segment_mean, segment_sum
 from oracles import loops
 
 MAX_VERSIONS = pytest.mark.parametrize("version", [reference.segment_max, cpu.segment_max], ids=["reference", "numba"])
@@ -29,6 +29,21 @@ def test_segments_agree_with_plain_loop(operation, reduce, rows, columns, size):
     values, segment = case(rows, columns, size)
     want = loops.segment(values.numpy(), segment.numpy(), size, reduce)
     np.testing.assert_allclose(operation(values, segment, size).numpy(), want, rtol=1e-12, atol=1e-12)
+
+
+@SIZES
+@pytest.mark.parametrize("name", ["segment_sum", "segment_mean", "segment_max"])
+def test_versions_for_graphs_equal_the_reference(name, rows, columns, size):
+    values, segment = case(rows, columns, size)
+    want = vars(reference)[name](values, segment, size)
+    torch.testing.assert_close(vars(graph)[name](values, segment, size), want, rtol=1e-12, atol=1e-12)
+
+
+def test_the_map_for_graphs_equals_the_reference():
+    index = torch.tensor([[0, 0, 1, 2], [1, 0, 0, 3], [0, 1, 1, 2]])
+    features = torch.arange(6.0).view(3, 2)
+    want = reference.scatter_bev(features, index, 2, (3, 4))
+    assert torch.equal(graph.scatter_bev(features, index, 2, (3, 4)), want)
 
 
 @SIZES

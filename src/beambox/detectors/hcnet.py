@@ -180,15 +180,17 @@ class HCNet(nn.Module):
 
     def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> AnchorPredictions:
         """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
-        grid = self.config.grid if grid is None else grid
-        voxels = self.voxels(batch, grid)
+        return self.from_voxels(self.voxels(batch, self.config.grid if grid is None else grid))
+
+    def from_voxels(self, voxels: Voxels) -> AnchorPredictions:
+        """Predict from points that are already gathered into voxels."""
         features = self.voxel_net(voxels)  # (V, C)
         stacks, pillars = pillar_stacks(features, voxels)  # (M, P, C), (M, 4)
         fused = self.fuse_slices(stacks)  # (M, C)
-        image = scatter_bev(fused, pillars, batch.size, grid.shape[1:])  # (B, C, ny, nx)
+        image = scatter_bev(fused, pillars, voxels.batch_size, voxels.grid.shape[1:])  # (B, C, ny, nx)
         bev = self.backbone(image)  # (B, 3 * 128, ny / 2, nx / 2)
         adapted = self.adapt(bev, image)  # (B, 2 * 128, ny / 2, nx / 2)
-        return self.head(adapted, grid)
+        return self.head(adapted, voxels.grid)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:

@@ -118,19 +118,21 @@ class PointPillars(nn.Module):
 
     def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> AnchorPredictions:
         """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
-        grid = self.config.grid if grid is None else grid
-        pillars = self.pillars(batch, grid)
+        return self.from_voxels(self.voxels(batch, self.config.grid if grid is None else grid))
+
+    def from_voxels(self, pillars: Voxels) -> AnchorPredictions:
+        """Predict from points that are already gathered into pillars."""
         features = self.pillar_net(pillars)  # (V, C)
         image = self.pseudo_image(features, pillars)  # (B, C, ny, nx)
         bev = self.backbone(image)  # (B, 3 * 128, ny / 2, nx / 2)
-        return self.head(bev, grid)
+        return self.head(bev, pillars.grid)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
         """Layers that work on whole maps."""
         return (self.backbone,)
 
-    def pillars(self, batch: Batch, grid: VoxelGrid) -> Voxels:
+    def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into pillars."""
         config = self.config
         points = batch.points[:, : config.columns]

@@ -56,6 +56,8 @@ def pillar_stacks(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
         ``(M, N, C)`` features of each occupied pillar, slices from the lowest up, zero where a slice is empty; and
         ``(M, 4)`` int64 (sample, 0, y, x) of the pillars.
     """
+    if torch.compiler.is_exporting():
+        return one_stack_a_voxel(features, voxels)
     nx, ny, slices = voxels.grid.size
     sample, z, y, x = voxels.index.unbind(dim=1)
     distinct, pillar = ((sample * ny + y) * nx + x).unique(return_inverse=True)  # (M,), (V,)
@@ -65,6 +67,23 @@ def pillar_stacks(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
     rows = torch.div(distinct, nx, rounding_mode="floor")  # (M,) sample * ny + y
     of_sample = torch.div(rows, ny, rounding_mode="floor")
     return stacks, torch.stack((of_sample, torch.zeros_like(rows), rows % ny, distinct % nx), dim=1)
+
+
+def one_stack_a_voxel(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
+    """Do as :func:`pillar_stacks` in a graph whose sizes are known before its values: M is V, the number of voxels.
+
+    The first voxel of each pillar holds the pillar's stack; the stacks of the others are zero.
+    """
+    nx, ny, slices = voxels.grid.size
+    sample, z, y, x = voxels.index.unbind(dim=1)
+    count, channels = features.shape
+    cell = (sample * ny + y) * nx + x  # (V,)
+    row = torch.arange(count, device=cell.device)
+    first = cell.new_full((voxels.batch_size * ny * nx,), count).scatter_reduce(0, cell, row, "amin")
+    pillar = first[cell]  # (V,) row of the pillar's first voxel
+    place = (pillar * slices + z)[:, None].expand_as(features)
+    stacks = features.new_zeros(count * slices, channels).scatter(0, place, features).view(count, slices, channels)
+    return stacks, torch.stack((sample, torch.zeros_like(z), y, x), dim=1)
 
 
 def pseudo_images(features: Tensor, voxels: Voxels) -> Tensor:

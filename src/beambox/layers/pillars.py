@@ -35,19 +35,19 @@ class PillarFeatures(nn.Module):
 
     def forward(self, voxels: Voxels) -> Tensor:
         """Return one feature a cell, ``(V, channels)``, all at least 0."""
-        xyz = voxels.points[:, :3]
-        mean = segment_mean(xyz, voxels.voxel, len(voxels.index))  # (V, 3)
+        xyz, size = voxels.points[:, :3], voxels.index.shape[0]
+        mean = segment_mean(xyz, voxels.voxel, size)  # (V, 3)
         centre = voxels.grid.centre(voxels.index[:, 1:]).to(xyz.dtype)  # (V, 3)
         absolute = voxels.points if self.absolute_xy else voxels.points[:, 2:]
         described = torch.cat((absolute, xyz - mean[voxels.voxel], xyz - centre[voxels.voxel]), dim=1)
         lifted = self.lift(described)  # (K, channels)
-        if len(lifted) < 2 and self.training:  # batch statistics need two values
+        if self.training and len(lifted) < 2:  # batch statistics need two values
             lifted = functional.batch_norm(
                 lifted, self.norm.running_mean, self.norm.running_var, self.norm.weight, self.norm.bias, eps=1e-3
             )
         else:
             lifted = self.norm(lifted)
-        features = segment_max(functional.relu(lifted), voxels.voxel, len(voxels.index))  # (V, channels)
+        features = segment_max(functional.relu(lifted), voxels.voxel, size)  # (V, channels)
         if self.empty_slots is None:
             return features
         of_zero = functional.batch_norm(

@@ -1,4 +1,7 @@
-"""Sums, means and maxima over groups of rows, and rows laid onto a bird's-eye-view map."""
+"""Sums, means and maxima over groups of rows, and rows laid onto a bird's-eye-view map.
+
+While ``torch.export`` traces a network, no value is known that could be checked: then ``graph.py`` runs.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
 from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
-from beambox.ops.scatter import reference
+from beambox.ops.scatter import graph, reference
 
 __all__ = ["scatter_bev", "segment_max", "segment_mean", "segment_sum"]
 
@@ -67,12 +70,16 @@ def segment_sum(values: Tensor, segment: Tensor, size: int) -> Tensor:
     Raises:
         BeamboxError: if a shape or type does not fit, or a segment is out of range.
     """
+    if torch.compiler.is_exporting():
+        return graph.segment_sum(values, segment, size)
     _check(values, segment, size)
     return choose("segment_sum", SUM_BACKENDS, values, segment)(values, segment, size)
 
 
 def segment_mean(values: Tensor, segment: Tensor, size: int) -> Tensor:
     """Average the rows of each segment; arguments and errors as in :func:`segment_sum`."""
+    if torch.compiler.is_exporting():
+        return graph.segment_mean(values, segment, size)
     _check(values, segment, size)
     return choose("segment_mean", MEAN_BACKENDS, values, segment)(values, segment, size)
 
@@ -83,6 +90,8 @@ def segment_max(values: Tensor, segment: Tensor, size: int) -> Tensor:
     The gradient goes to one row: the first of those that hold the maximum, on every backend. A NaN counts as larger
     than any number, so it is seen rather than skipped. Zero where a segment has no row.
     """
+    if torch.compiler.is_exporting():
+        return graph.segment_max(values, segment, size)
     _check(values, segment, size)
     return choose("segment_max", MAX_BACKENDS, values, segment)(values, segment, size)
 
@@ -102,6 +111,8 @@ def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[in
     Raises:
         BeamboxError: if a shape or type does not fit, or an index leaves the map.
     """
+    if torch.compiler.is_exporting():
+        return graph.scatter_bev(features, index, batch_size, size)
     expect_shape("features", features, (None, None))
     expect_shape("index", index, (len(features), 4))
     expect_dtype("index", index, torch.int64)

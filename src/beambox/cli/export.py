@@ -1,0 +1,61 @@
+"""`beambox export`: write a detector as an ONNX file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from beambox.cli import options
+from beambox.cli.console import announce, show_log
+
+__all__ = ["command"]
+
+
+def command(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="Shipped name, .safetensors file, or folder of a run.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The .onnx file to write.")],
+    opset: Annotated[int, typer.Option(metavar="N", help="Version of ONNX's operators, 18 to 23.")] = 18,
+    sweep: Annotated[
+        str, typer.Option("--verify", metavar="SCAN", help="Compare with PyTorch on this sweep too before writing.")
+    ] = "",
+    range_: options.RangeOption = "",
+) -> None:
+    """Write PointPillars or HCNet as one ONNX file, weights and settings inside.
+
+    The file takes points gathered into voxels and gives boxes and scores of all anchors; docs/export.md says how both
+    ends are done. It is written only if onnxruntime computes from it what PyTorch computes.
+
+    Examples:
+      beambox export pointpillars-kitti --out pointpillars.onnx
+      beambox export run --out run.onnx --verify scan.bin --range 50
+    """
+    from beambox.detectors.weights import load_weights, read_weights
+    from beambox.export.onnx_check import TOLERANCE
+    from beambox.export.onnx_file import export_onnx, exportable
+    from beambox.infer.predictor import Detector, find_weights, region
+
+    show_log()
+    announce("export", detail=model)
+    path = find_weights(model)
+    network = exportable(load_weights(path))
+    wanted = options.parse_range(range_)
+    grid = network.config.grid if wanted is None else region(network.config.grid, wanted)
+    sweeps = {}
+    if sweep:
+        reader = Detector(network, device="cpu", precision="float32", grid=grid)
+        sweeps = {sweep: reader.prepare(reader.read(sweep)).points}
+    card = read_weights(path).card
+    written = export_onnx(network, out, grid=grid, opset=opset, card=card, sweeps=sweeps)
+    print(f"{out}: {model} ({', '.join(network.config.classes)}), {written.size / 1e6:.1f} MB, opset {opset}")
+    print("  in   " + ", ".join(f"{name} {shape}" for name, shape in written.inputs.items()))
+    print("  out  " + ", ".join(f"{name} {shape}" for name, shape in written.outputs.items()))
+    for found in written.checks:
+        turned = f"; half turns left to rounding: {found.half_turns}" if found.half_turns else ""
+        print(
+            f"  {found.sweep}, {found.points:,} points in {found.voxels:,} voxels: onnxruntime and PyTorch differ by "
+            f"{found.scores:.1e} in scores, {found.boxes:.1e} in boxes (allowed {TOLERANCE:.0e}){turned}"
+        )
+    if not written.checks:
+        print("  not compared with PyTorch: onnxruntime is not installed (pip install 'beambox[export]')")
