@@ -106,6 +106,7 @@ def test_settings_given_in_part_keep_the_defaults_of_the_detector() -> None:
         ({"post": {"nms_io": 0.1}}, 'no field "post.nms_io".*did you mean "nms_iou"'),
         ({"max_points": "many"}, "max_points"),
         ({"depths": [1]}, "same length"),
+        ({"up_strides": [1, 2, 2]}, r"with strides \[2, 2, 2\] they are \[1, 2, 4\], got \[1, 2, 2\]"),
     ],
 )
 def test_wrong_options_are_named(options: dict, message: str) -> None:

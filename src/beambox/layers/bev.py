@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import expect_same_length
+from beambox.checks import BeamboxError, expect_same_length
 
 __all__ = ["BevBackbone", "MapBlock", "conv_bn_relu", "deconv_bn_relu"]
 
@@ -49,6 +50,9 @@ class BevBackbone(nn.Module):
 
     Stage i: one convolution with stride ``strides[i]`` and ``depths[i]`` further ones of width ``widths[i]``; its
     output is enlarged ``up_strides[i]`` times to ``up_widths[i]`` channels.
+
+    Raises:
+        BeamboxError: where the lists differ in length, or a stage would not come back to the size of the first.
     """
 
     def __init__(
@@ -68,6 +72,12 @@ class BevBackbone(nn.Module):
             up_strides=len(up_strides),
             up_widths=len(up_widths),
         )
+        needed = [math.prod(strides[1 : stage + 1]) for stage in range(len(strides))]
+        if list(up_strides) != needed:
+            raise BeamboxError(
+                f"`up_strides` must bring every stage back to the size of the first: with strides {list(strides)} they "
+                f"are {needed}, got {list(up_strides)}"
+            )
         self.stages = nn.ModuleList()
         self.ups = nn.ModuleList()
         for depth, stride, width, up_stride, up_width in zip(depths, strides, widths, up_strides, up_widths):
