@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+
 import torch
 from timing import shortest
 from torch import Tensor
@@ -22,7 +24,25 @@ def density_voxels(count: int, generator: torch.Generator) -> Tensor:
     return voxelize.voxelize(points, sample, 1, grid, max_voxels=count).index
 
 
+def maps_added(side: int = 188) -> float:
+    """Return by how many maps as large as K the process grows in a forward and backward pass, inputs included."""
+
+    def peak() -> float:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # Linux counts in KiB
+
+    def run(size: int) -> None:
+        q, k, v = (torch.randn(1, 2, size, size, 32, requires_grad=True) for _ in range(3))
+        bias = torch.zeros(2, 13, 13, requires_grad=True)
+        attention.neighborhood_attention(q, k, v, bias).sum().backward()
+
+    run(7)  # compiles
+    before = peak()
+    run(side)
+    return (peak() - before) / (4 * 64 * side**2)
+
+
 def main() -> None:
+    print(f"memory: inputs, output, gradients add {maps_added():.0f} maps of K; copies for 49 neighbours would add 98")
     generator = torch.Generator().manual_seed(0)
     print(f"{torch.get_num_threads()} threads; the shortest of several runs")
     q, k, v = (torch.randn(1, 2, 188, 188, 32, generator=generator).requires_grad_() for _ in range(3))

@@ -1,5 +1,9 @@
 """Neighbourhood attention: reference against plain loops, numba against the reference, every gradient."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +12,7 @@ from beambox.checks import BeamboxError
 from beambox.ops.neighborhood import cpu, neighborhood_attention, reference
 from beambox.ops.neighborhood.windows import queries_of, window_start
 from oracles import neighborhood as attention
+from oracles.paths import ROOT
 
 VERSIONS = pytest.mark.parametrize(
     "version", [reference.neighborhood_attention, cpu.neighborhood_attention], ids=["reference", "numba"]
@@ -31,6 +36,15 @@ def test_attention_agrees_with_plain_loops(version, shape, window):
     parts = case(shape, window)
     want = attention.neighborhood_attention(*(part.detach().numpy() for part in parts), window)
     np.testing.assert_allclose(version(*parts, window).detach().numpy(), want, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems count memory in other units")
+def test_no_copy_of_keys_and_values_for_each_neighbour():
+    code = "import neighborhood; print(neighborhood.maps_added(128))"
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "benchmarks"), str(ROOT / "src")])}
+    ran = subprocess.run([sys.executable, "-c", code], env=paths, capture_output=True, text=True, check=True)
+    maps = float(ran.stdout)  # q, k, v, output, their four gradients and a few working rows; with copies 98 more
+    assert 4 < maps < 20
 
 
 @SHAPES
