@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import torch
 
 import beambox
 from beambox import BeamboxError, Detections, Frame, VoxelGrid
+from beambox.detectors.pointpillars import PointPillars
+from beambox.detectors.weights import save_weights
 from beambox.infer.predictor import Detector, find_weights, load, region
 from oracles.tiny_detector import GRID, kitti_folder, street, tiny_model, tiny_weights
 
@@ -137,6 +140,19 @@ def test_range_looks_behind(weights: Path, detector: Detector) -> None:
     assert (around(behind).boxes[:, 0] < -1).any()
     assert not (detector(behind).boxes[:, 0] < -3).any()
     assert around.grid.cell == detector.grid.cell
+
+
+@pytest.mark.parametrize("absolute_xy", [False, True])
+def test_networks_that_know_positions_warn_beyond_the_trained_region(
+    absolute_xy: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "other.safetensors"
+    save_weights(path, PointPillars(replace(tiny_model().config, absolute_xy=absolute_xy)))
+    with caplog.at_level("WARNING", logger="beambox"):
+        load(path, range=[0, -8, 16, 8])
+        assert not caplog.records, "part of the trained region"
+        load(path, range=20)
+    assert [("absolute_xy" in record.getMessage()) for record in caplog.records] == [True] * absolute_xy
 
 
 def test_region_rounds_outwards_to_whole_steps_in_phase_with_training() -> None:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.reading import points_from_array
+from beambox.detectors.catalogue import config_to_dict
 from beambox.detectors.weights import load_weights, read_weights
 from beambox.geometry import VoxelGrid
 from beambox.geometry.axes import Axes
@@ -230,6 +231,11 @@ def region(model_grid: VoxelGrid, wanted: float | Sequence[float] | VoxelGrid) -
     )
 
 
+def covers(trained: VoxelGrid, wanted: VoxelGrid) -> bool:
+    """Whether one region lies within another, seen from above."""
+    return all(trained.minimum[k] <= wanted.minimum[k] and wanted.maximum[k] <= trained.maximum[k] for k in (0, 1))
+
+
 def find_weights(name: str | Path) -> Path:
     """Find a weight file: a shipped name, a path, or the folder of a training run.
 
@@ -304,13 +310,19 @@ def load(
         raise_by=0.0 if sensor_height is None else sensor_height - trained,
         slope=ground_slope,
     )
-    grid: VoxelGrid = model.config.grid
+    grid: VoxelGrid = model.config.grid if range is None else region(model.config.grid, range)
+    if config_to_dict(model.config).get("absolute_xy", True) and not covers(model.config.grid, grid):
+        log.warning(
+            "%s learnt where things are as seen from the sensor (its absolute_xy is on) and looks beyond the region it "
+            "was trained on: expect less of it there",
+            name,
+        )
     return Detector(
         model,
         card=card,
         device=chosen,
         precision=precision,
-        grid=grid if range is None else region(grid, range),
+        grid=grid,
         view=view,
         corrections=corrections,
         intensity_scale=intensity_scale,
