@@ -128,13 +128,20 @@ def test_a_recipe_written_down_can_be_read_again() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hcnet_once", "dennet_once", "voxelrcnn_once"])
+@pytest.mark.parametrize(
+    ("name", "cell"),
+    [
+        ("pointpillars_once", [0.4, 0.4, 8.0]),
+        ("hcnet_once", [0.4, 0.4, 1.0]),
+        ("second_once", [0.2, 0.2, 0.2]),
+        ("voxelrcnn_once", [0.2, 0.2, 0.2]),
+        ("dennet_once", [0.2, 0.2, 0.2]),
+    ],
+)
 def test_recipes_for_once_train_on_simulated_data(
-    name: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, cell: list[float], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    height = 1.0 if name == "hcnet_once" else 0.2
-    side = 0.4 if name == "hcnet_once" else 0.2
-    grid = f"{{minimum: [-12.8, -12.8, -5.0], maximum: [12.8, 12.8, 3.0], cell: [{side}, {side}, {height}]}}"
+    grid = f"{{minimum: [-12.8, -12.8, -5.0], maximum: [12.8, 12.8, 3.0], cell: {cell}}}"
     changes = ["optim.iterations=2", "optim.epochs=null", "optim.batch=1", "workers=0", f"detector.options.grid={grid}"]
     made = read_recipe(ROOT / "recipes" / f"{name}.yaml", changes)
     assert train(made, data, tmp_path / "run").finished
