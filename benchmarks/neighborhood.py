@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import resource
-
 import torch
-from timing import shortest
+from timing import memory_added, shortest
 from torch import Tensor
 
 from beambox.geometry.grid import VoxelGrid
@@ -27,18 +25,13 @@ def density_voxels(count: int, generator: torch.Generator) -> Tensor:
 def maps_added(side: int = 188) -> float:
     """Return by how many maps as large as K the process grows in a forward and backward pass, inputs included."""
 
-    def peak() -> float:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # Linux counts in KiB
-
     def run(size: int) -> None:
         q, k, v = (torch.randn(1, 2, size, size, 32, requires_grad=True) for _ in range(3))
         bias = torch.zeros(2, 13, 13, requires_grad=True)
         attention.neighborhood_attention(q, k, v, bias).sum().backward()
 
     run(7)  # compiles
-    before = peak()
-    run(side)
-    return (peak() - before) / (4 * 64 * side**2)
+    return memory_added(lambda: run(side)) / (4 * 64 * side**2)
 
 
 def main() -> None:

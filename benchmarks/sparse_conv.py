@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from timing import memory_added
 from torch import Tensor, nn
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -147,9 +147,7 @@ def serve(arguments: argparse.Namespace) -> None:
     """Be one side until the input ends: answer `run` with wall and CPU seconds, `save PATH`, and `parts`."""
     torch.set_num_threads(arguments.threads)
     side = {"ours": Ours, "spconv": Spconv}[arguments.side](arguments.scan, getattr(torch, arguments.dtype))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    side.run()
-    memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    memory = memory_added(side.run) / 2**20
     print(f"ready {len(side.voxels.features)} {memory:.0f}", flush=True)
     for line in sys.stdin:
         word, _, rest = line.strip().partition(" ")

@@ -71,8 +71,7 @@ def test_single_stage_agrees(model):
         with torch.inference_mode():
             predictions = network(batch)
             boxes = predictions.decoded()[0]
-        voxels = network.pillars if model == "pointpillars" else network.voxels
-        assert len(voxels(batch, network.config.grid).index) == int(recorded["num_voxels"])
+        assert len(network.voxels(batch, network.config.grid).index) == int(recorded["num_voxels"])
         assert predictions.cls.shape[1] == int(recorded["total"])
         index = recorded["index"].long()
         assert relative_error(predictions.cls[0, index], recorded["cls"]) < RELATIVE
