@@ -38,7 +38,7 @@ def test_attention_agrees_with_plain_loops(version, shape, window):
     np.testing.assert_allclose(version(*parts, window).detach().numpy(), want, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems count memory in other units")
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 def test_no_copy_of_keys_and_values_for_each_neighbour():
     code = "import neighborhood; print(neighborhood.maps_added(128))"
     paths = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "benchmarks"), str(ROOT / "src")])}

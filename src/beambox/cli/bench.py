@@ -16,7 +16,7 @@ __all__ = ["command"]
 
 
 def command(
-    model: Annotated[str, typer.Argument(metavar="MODEL", help="Shipped name, .safetensors file, or folder of a run.")],
+    model: options.ModelArgument,
     inputs: Annotated[
         list[str] | None, typer.Argument(metavar="[INPUT]...", help="Sweeps; one simulated if none.")
     ] = None,

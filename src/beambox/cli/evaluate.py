@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from beambox.cli.options import DeviceOption, PrecisionOption, RangeOption, ViewOption, parse_range
+from beambox.cli.options import DeviceOption, ModelArgument, PrecisionOption, RangeOption, ViewOption, parse_range
 
 __all__ = ["command"]
 
 
 def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
-    model: Annotated[str, typer.Argument(help="Shipped name, .safetensors file, or folder of a run.")],
+    model: ModelArgument,
     data: Annotated[Path, typer.Option(help="KITTI or ONCE folder, or the YAML file of one's own data.")],
     split: Annotated[str, typer.Option(help="List of frames: the name of a file in ImageSets.")] = "val",
     classes: Annotated[str, typer.Option(help="Classes to score, as Car,Cyclist; the model's where not given.")] = "",

@@ -14,7 +14,7 @@ __all__ = ["command"]
 
 
 def command(
-    model: Annotated[str, typer.Argument(metavar="MODEL", help="Shipped name, .safetensors file, or folder of a run.")],
+    model: options.ModelArgument,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The .onnx file to write.")],
     opset: Annotated[int, typer.Option(metavar="N", help="Version of ONNX's operators, 18 to 23.")] = 18,
     sweep: Annotated[

@@ -17,6 +17,7 @@ __all__ = [
     "InputsArgument",
     "IntensityOption",
     "MinScoreOption",
+    "ModelArgument",
     "ModelOption",
     "PrecisionOption",
     "RangeOption",
@@ -28,6 +29,9 @@ __all__ = [
 
 InputsArgument = Annotated[
     list[str], typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns, recordings.")
+]
+ModelArgument = Annotated[
+    str, typer.Argument(metavar="MODEL", help="Shipped name, .safetensors file, or folder of a run.")
 ]
 ModelOption = Annotated[
     str, typer.Option("--model", "-m", metavar="M", help="Shipped name, .safetensors file, or folder of a run.")

@@ -29,6 +29,11 @@ class DetectorConfig(Protocol):
         """The region and the cells the network works on."""
         ...
 
+    @property
+    def absolute_xy(self) -> bool:
+        """Whether x and y enter as seen from the sensor, so that what was learnt holds in the trained region alone."""
+        ...
+
 
 P = TypeVar("P")
 

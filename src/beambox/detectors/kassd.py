@@ -130,6 +130,8 @@ class KassdConfig:
     """Voxels kept in a sweep, in order of first appearance; None keeps all."""
     columns: int = 4
     """Values of a point: x, y, z, intensity, ..."""
+    absolute_xy: bool = True
+    """Whether a voxel's mean x and y are told from the sensor; else from the voxel's centre."""
     encoder_widths: tuple[int, int, int, int] = (16, 32, 64, 64)
     """Channels of the sparse encoder's stages."""
     encoder_out: int = 128
@@ -223,7 +225,7 @@ class Kassd(nn.Module):
     def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> KassdPredictions:
         """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
         grid = self.config.grid if grid is None else grid
-        voxels = mean_voxels(self.voxels(batch, grid))  # (V, columns)
+        voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
         stages = self.encoder(voxels)
         bev = self.neck(stages.bev)  # (B, 128, ny / 8, nx / 8)
         maps = None if self.kam is None else self.kam(bev)  # (B, K, ny / 8, nx / 8)

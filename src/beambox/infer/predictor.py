@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.reading import points_from_array
-from beambox.detectors.catalogue import config_to_dict
 from beambox.detectors.weights import load_weights, read_weights
 from beambox.geometry import VoxelGrid
 from beambox.geometry.axes import Axes
@@ -311,7 +310,7 @@ def load(
         slope=ground_slope,
     )
     grid: VoxelGrid = model.config.grid if range is None else region(model.config.grid, range)
-    if config_to_dict(model.config).get("absolute_xy", True) and not covers(model.config.grid, grid):
+    if model.config.absolute_xy and not covers(model.config.grid, grid):
         log.warning(
             "%s learnt where things are as seen from the sensor (its absolute_xy is on) and looks beyond the region it "
             "was trained on: expect less of it there",
