@@ -34,7 +34,7 @@ class _Style:
     """Front edge of the bonnet."""
 
 
-FRONT_MARGIN, REAR_MARGIN, SIDE_MARGIN = (0.08, 0.18), (0.04, 0.12), (0.02, 0.08)
+FRONT_MARGIN, REAR_MARGIN, SIDE_MARGIN = (0.10, 0.22), (0.05, 0.15), (0.02, 0.09)
 """Gap between a car's body and its label's box, metres; KITTI's labels leave it, mostly at the nose."""
 
 CAR_STYLES: dict[str, _Style] = {
