@@ -33,6 +33,8 @@ class Detections:
         expect_shape("boxes", self.boxes, ("N", 7))
         expect_shape("scores", self.scores, ("N",))
         expect_same_length(boxes=len(self.boxes), scores=len(self.scores), labels=len(self.labels))
+        if self.labels.device.type != "cpu":  # a GPU would have to be waited for; they are checked when brought home
+            return
         if len(self.labels) and not 0 <= int(self.labels.min()) <= int(self.labels.max()) < len(self.classes):
             raise BeamboxError(
                 f"`labels` must lie in 0 to {len(self.classes) - 1}, the positions in `classes`, "
