@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +12,36 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
 from beambox.metrics import once
+from beambox.metrics.box_errors import box_errors
+from beambox.metrics.box_errors_result import BoxErrors
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
 from beambox.metrics.once_result import OnceResult
 from beambox.structures import Batch, Detections, Frame
 
 __all__ = [
+    "Evaluation",
     "detect_frames",
+    "evaluate_frames",
     "network",
-    "parse_overlaps",
     "score_frames",
     "score_once",
     "scored_frames",
-    "write_results",
+    "write_result",
 ]
 
 Detect = Callable[[Sequence[Frame]], list[Detections]]
 """Frames to their detections, best first, on the CPU; ``Detector.detect`` is one, :func:`network` makes one."""
 
 
-def network(model: Any) -> Detect:
-    """Detect with a bare network as it stands, in training say: its mode is restored after each call."""
+def network(model: Any, dtype: torch.dtype = torch.float32) -> Detect:
+    """Detect with a bare network as it stands, in training say: its mode is restored after each call.
+
+    Args:
+        model: a detector of the catalogue.
+        dtype: what it computes in, under autocast where that is not float32, as :class:`Detector` does.
+    """
+    lower = dtype != torch.float32
 
     @torch.inference_mode()
     def detect(frames: Sequence[Frame]) -> list[Detections]:
@@ -40,28 +49,14 @@ def network(model: Any) -> Detect:
         was_training = model.training
         model.eval()
         try:
-            found = model.decode(model(Batch.of(frames).to(device)))
+            with torch.autocast(device.type, dtype=dtype if lower else torch.bfloat16, enabled=lower):
+                predictions = model(Batch.of(frames).to(device))
+            found = model.decode(predictions)
         finally:
             model.train(was_training)
         return [replace(one.to("cpu"), frame_id=frame.id) for frame, one in zip(frames, found)]
 
     return detect
-
-
-def parse_overlaps(texts: Sequence[str]) -> dict[str, float]:
-    """Read overlaps given as ``Car=0.5``.
-
-    Raises:
-        BeamboxError: quoting what cannot be read.
-    """
-    overlaps = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            overlaps[name] = float(value)
-        except ValueError:
-            raise BeamboxError(f'an overlap is given as CLASS=VALUE, as Car=0.5; got "{text}"') from None
-    return overlaps
 
 
 def detect_frames(
@@ -127,21 +122,98 @@ def score_once(
     return once.evaluate(pairs, min_overlap=iou, known=known)
 
 
-def write_results(folder: Path, frames: Sequence[KittiFrame]) -> None:
-    """Write one KITTI result file a frame, for other evaluators and the benchmark's server.
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of one set of detections, with what they were made in."""
+
+    rounds: tuple[KittiResult | OnceResult, ...]
+    """The scores; a class that is scored at several overlaps stands in several."""
+    errors: BoxErrors
+    """Errors of the matched boxes."""
+    precision: str
+    """What the network computed in, such as ``float32``."""
+
+    def to_json(self) -> dict[str, dict[str, Any]]:
+        """Return numbers ready for ``json.dump``: an entry a class, ``NAME@IOU`` for its second overlap and on."""
+        entries: dict[str, dict[str, Any]] = {}
+        for result in self.rounds:
+            for name, entry in result.to_json().items():
+                if name not in entries:
+                    entries[name] = {**entry, "precision": self.precision}
+                elif "iou" in entry and entry["iou"] != entries[name]["iou"]:
+                    entries[f"{name}@{entry['iou']:g}"] = {**entry, "precision": self.precision}
+        for name, errors in self.errors.to_json().items():
+            if name in entries:
+                entries[name]["errors"] = errors
+        return entries
+
+    def table(self, name: str = "this result", published: bool = False) -> str:
+        """Return the numbers as text.
+
+        Args:
+            name: of the detector.
+            published: add the rows of DenNet's Table 3 (ONCE alone).
+        """
+        tables = [
+            result.table(name, published) if isinstance(result, OnceResult) else result.table()
+            for result in self.rounds
+        ]
+        return "\n".join([*tables, self.errors.table(), f"detected in {self.precision}\n"])
+
+
+def evaluate_frames(
+    frames: Sequence[KittiFrame],
+    classes: Sequence[str],
+    rounds: Sequence[Mapping[str, float]] = ({},),
+    *,
+    by_once: bool = False,
+    levels: bool = True,
+    precision: str = "float32",
+) -> Evaluation:
+    """Score frames and measure the errors of the matched boxes.
+
+    Args:
+        frames: from :func:`scored_frames`.
+        classes: to score.
+        rounds: overlaps that count as found, by class, where they differ from the metric's own; in the second round
+            and on, only the classes named there are scored again.
+        by_once: by ONCE's rules instead of KITTI's.
+        levels: as for :func:`score_frames`.
+        precision: what the detections were made in.
 
     Raises:
-        BeamboxError: if a frame has no calibration; KITTI's boxes live in the camera's frame.
+        BeamboxError: if an overlap is missing, out of range, or of a class that is not scored.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for frame in frames:
-        if frame.calibration is None:
-            raise BeamboxError(
-                f"frame {frame.detections.frame_id} has no calibration, so KITTI result files cannot be written; "
-                "use `beambox detect --format json`"
-            )
-        text = frame.detections.to_kitti(frame.calibration, frame.image_size)
-        path = folder / f"{frame.detections.frame_id}.txt"
-        temporary = path.with_name(f".{path.name}.part")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+    results: list[KittiResult | OnceResult] = []
+    for number, overlaps in enumerate(rounds or ({},)):
+        wanted = list(overlaps) if number else classes
+        scored = score_once(frames, overlaps, wanted) if by_once else score_frames(frames, wanted, overlaps, levels)
+        results.append(scored)
+    if not by_once:
+        return Evaluation(tuple(results), box_errors(frames, classes), precision)
+    merged = [_merged(frame) for frame in frames]
+    names = list(dict.fromkeys(once.SUPERCLASS_OF.get(name, name) for name in classes))
+    return Evaluation(tuple(results), box_errors(merged, names), precision)
+
+
+def _merged(frame: KittiFrame) -> KittiFrame:
+    """Name objects and detections by ONCE's merged classes."""
+    merge, labels, found = once.SUPERCLASS_OF, frame.labels, frame.detections
+    named = replace(labels, names=tuple(merge.get(name, name) for name in labels.names))
+    return frame._replace(
+        labels=named, detections=replace(found, classes=tuple(merge.get(name, name) for name in found.classes))
+    )
+
+
+def write_result(folder: Path, frame: Frame, detections: Detections) -> None:
+    """Write a frame's KITTI result file.
+
+    Raises:
+        BeamboxError: if the frame has no calibration; KITTI's boxes live in the camera's frame.
+    """
+    if frame.calibration is None:
+        raise BeamboxError(
+            f"frame {frame.id} has no calibration, so KITTI result files cannot be written; "
+            "keep the detections with --keep FILE, or use `beambox detect --format json`"
+        )
+    write_text(folder / f"{check_file_name(frame.id)}.txt", detections.to_kitti(frame.calibration, frame.image_size))
