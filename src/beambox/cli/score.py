@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from beambox.checks import BeamboxError
 from beambox.cli.main import guard, help_of
+from beambox.cli.options import ClassesOption, IouOption, parse_classes, parse_overlaps
 
 __all__ = ["app", "parse_overlaps"]
 
@@ -22,28 +22,13 @@ app = typer.Typer(
 )
 
 Json = Annotated[Path | None, typer.Option("--json", help="also write the numbers to this file")]
-Iou = Annotated[str, typer.Option("--iou", help="other IoU thresholds, for example Car=0.5,Pedestrian=0.25")]
-
-
-def parse_overlaps(text: str) -> dict[str, float]:
-    """Read IoU thresholds written as ``Car=0.5,Pedestrian=0.25``."""
-    found = {}
-    for part in filter(None, (piece.strip() for piece in text.split(","))):
-        name, sign, value = part.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            sign = ""
-        if not sign or not name.strip():
-            raise BeamboxError(f"--iou takes CLASS=NUMBER pairs such as Car=0.5,Pedestrian=0.25; cannot read {part!r}")
-    return found
 
 
 def write_json(path: Path, content: Any) -> None:
     """Write numbers for other programs."""
     import json
 
-    from beambox.data.files import write_text
+    from beambox.io import write_text
 
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
@@ -52,8 +37,8 @@ def kitti(
     labels: Annotated[Path, typer.Option(help="folder of label files (or the KITTI root above label_2)")],
     results: Annotated[Path, typer.Option(help="folder of result files, one a frame; empty: nothing found")],
     frames: Annotated[Path | None, typer.Option(help="file with one frame name a line; default: every label")] = None,
-    classes: Annotated[str, typer.Option(help="classes to score, comma-separated")] = "Car,Pedestrian,Cyclist",
-    iou: Iou = "",
+    classes: ClassesOption = "Car,Pedestrian,Cyclist",
+    iou: IouOption = None,
     no_difficulty: Annotated[
         bool, typer.Option("--no-difficulty", help="every object counts; 3d and bev only")
     ] = False,
@@ -74,7 +59,7 @@ def kitti(
         labels,
         results,
         None if frames is None else read_frame_list(frames),
-        [name.strip() for name in classes.split(",") if name.strip()],
+        parse_classes(classes),
         min_overlap=parse_overlaps(iou),
         no_difficulty=no_difficulty,
         python_port=python_port,
@@ -89,7 +74,7 @@ def once(
     annotations: Annotated[Path, typer.Option(help="JSON with ground_truth, and with predictions unless --results")],
     results: Annotated[Path | None, typer.Option(help="JSON list of predictions in a file of its own")] = None,
     five_classes: Annotated[bool, typer.Option("--five-classes", help="do not merge Car, Bus, Truck")] = False,
-    iou: Iou = "",
+    iou: IouOption = None,
     true_rotation: Annotated[bool, typer.Option("--true-rotation", help="turn boxes the right way round")] = False,
     published: Annotated[bool, typer.Option("--published", help="also print the rows of DenNet's Table 3")] = False,
     json: Json = None,

@@ -11,6 +11,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
+from beambox.io import check_file_name, write_text
 from beambox.metrics import once
 from beambox.metrics.box_errors import box_errors
 from beambox.metrics.box_errors_result import BoxErrors
@@ -24,10 +25,13 @@ __all__ = [
     "detect_frames",
     "evaluate_frames",
     "network",
+    "parse_overlaps",
+    "parse_rounds",
     "score_frames",
     "score_once",
     "scored_frames",
     "write_result",
+    "write_results",
 ]
 
 Detect = Callable[[Sequence[Frame]], list[Detections]]
@@ -57,6 +61,40 @@ def network(model: Any, dtype: torch.dtype = torch.float32) -> Detect:
         return [replace(one.to("cpu"), frame_id=frame.id) for frame, one in zip(frames, found)]
 
     return detect
+
+
+def parse_overlaps(texts: Sequence[str]) -> dict[str, float]:
+    """Read overlaps, each class once, given as ``Car=0.5`` or ``Car=0.5,Cyclist=0.25``.
+
+    Raises:
+        BeamboxError: quoting what cannot be read.
+    """
+    rounds = parse_rounds(texts)
+    if len(rounds) > 1:
+        raise BeamboxError(f"an overlap is given once for each class; {next(iter(rounds[1]))} has several")
+    return rounds[0]
+
+
+def parse_rounds(texts: Sequence[str]) -> list[dict[str, float]]:
+    """Read overlaps given as ``Car=0.7,Car=0.5``: the first of each class, then the second of those that have one, ...
+
+    Raises:
+        BeamboxError: quoting what cannot be read.
+    """
+    rounds: list[dict[str, float]] = [{}]
+    for text in (part.strip() for given in texts for part in given.split(",") if part.strip()):
+        name, _, value = (word.strip() for word in text.partition("="))
+        try:
+            overlap = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise BeamboxError(f'an overlap is given as CLASS=VALUE, as Car=0.5; got "{text}"')
+        free = next((one for one in rounds if name not in one), None)
+        if free is None:
+            rounds.append(free := {})
+        free[name] = overlap
+    return rounds
 
 
 def detect_frames(
@@ -205,15 +243,22 @@ def _merged(frame: KittiFrame) -> KittiFrame:
     )
 
 
-def write_result(folder: Path, frame: Frame, detections: Detections) -> None:
-    """Write a frame's KITTI result file.
+def write_result(folder: Path, frame: Frame | KittiFrame, detections: Detections) -> None:
+    """Write a frame's KITTI result file, for other evaluators and the benchmark's server.
 
     Raises:
         BeamboxError: if the frame has no calibration; KITTI's boxes live in the camera's frame.
     """
     if frame.calibration is None:
         raise BeamboxError(
-            f"frame {frame.id} has no calibration, so KITTI result files cannot be written; "
+            f"frame {detections.frame_id} has no calibration, so KITTI result files cannot be written; "
             "keep the detections with --keep FILE, or use `beambox detect --format json`"
         )
-    write_text(folder / f"{check_file_name(frame.id)}.txt", detections.to_kitti(frame.calibration, frame.image_size))
+    name = check_file_name(detections.frame_id, "names of frames")
+    write_text(folder / f"{name}.txt", detections.to_kitti(frame.calibration, frame.image_size))
+
+
+def write_results(folder: Path, frames: Sequence[KittiFrame]) -> None:
+    """Write the result files of several frames; see :func:`write_result`."""
+    for frame in frames:
+        write_result(folder, frame, frame.detections)
