@@ -18,15 +18,16 @@ from beambox.metrics.box_errors_result import BoxErrors
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
 from beambox.metrics.once_result import OnceResult
-from beambox.structures import Batch, Detections, Frame
+from beambox.metrics.rounds import merge_entries, parse_rounds, score_rounds
+from beambox.structures import Batch, Detections, Frame, Labels
 
 __all__ = [
     "Evaluation",
+    "check_classes",
     "detect_frames",
     "evaluate_frames",
     "network",
     "parse_overlaps",
-    "parse_rounds",
     "score_frames",
     "score_once",
     "scored_frames",
@@ -71,30 +72,8 @@ def parse_overlaps(texts: Sequence[str]) -> dict[str, float]:
     """
     rounds = parse_rounds(texts)
     if len(rounds) > 1:
-        raise BeamboxError(f"an overlap is given once for each class; {next(iter(rounds[1]))} has several")
+        raise BeamboxError(f"one overlap is wanted for each class; {next(iter(rounds[1]))} has several")
     return rounds[0]
-
-
-def parse_rounds(texts: Sequence[str]) -> list[dict[str, float]]:
-    """Read overlaps given as ``Car=0.7,Car=0.5``: the first of each class, then the second of those that have one, ...
-
-    Raises:
-        BeamboxError: quoting what cannot be read.
-    """
-    rounds: list[dict[str, float]] = [{}]
-    for text in (part.strip() for given in texts for part in given.split(",") if part.strip()):
-        name, _, value = (word.strip() for word in text.partition("="))
-        try:
-            overlap = float(value)
-        except ValueError:
-            name = ""
-        if not name:
-            raise BeamboxError(f'an overlap is given as CLASS=VALUE, as Car=0.5; got "{text}"')
-        free = next((one for one in rounds if name not in one), None)
-        if free is None:
-            rounds.append(free := {})
-        free[name] = overlap
-    return rounds
 
 
 def detect_frames(
@@ -173,13 +152,9 @@ class Evaluation:
 
     def to_json(self) -> dict[str, dict[str, Any]]:
         """Return numbers ready for ``json.dump``: an entry a class, ``NAME@IOU`` for its second overlap and on."""
-        entries: dict[str, dict[str, Any]] = {}
-        for result in self.rounds:
-            for name, entry in result.to_json().items():
-                if name not in entries:
-                    entries[name] = {**entry, "precision": self.precision}
-                elif "iou" in entry and entry["iou"] != entries[name]["iou"]:
-                    entries[f"{name}@{entry['iou']:g}"] = {**entry, "precision": self.precision}
+        entries = merge_entries(self.rounds)
+        for entry in entries.values():
+            entry["precision"] = self.precision
         for name, errors in self.errors.to_json().items():
             if name in entries:
                 entries[name]["errors"] = errors
@@ -213,8 +188,8 @@ def evaluate_frames(
     Args:
         frames: from :func:`scored_frames`.
         classes: to score.
-        rounds: overlaps that count as found, by class, where they differ from the metric's own; in the second round
-            and on, only the classes named there are scored again.
+        rounds: overlaps that count as found, by class, where they differ from the metric's own; after the first round
+            only the classes named are scored again.
         by_once: by ONCE's rules instead of KITTI's.
         levels: as for :func:`score_frames`.
         precision: what the detections were made in.
@@ -222,16 +197,36 @@ def evaluate_frames(
     Raises:
         BeamboxError: if an overlap is missing, out of range, or of a class that is not scored.
     """
-    results: list[KittiResult | OnceResult] = []
-    for number, overlaps in enumerate(rounds or ({},)):
-        wanted = list(overlaps) if number else classes
-        scored = score_once(frames, overlaps, wanted) if by_once else score_frames(frames, wanted, overlaps, levels)
-        results.append(scored)
+
+    def score(names: Sequence[str], overlaps: Mapping[str, float]) -> KittiResult | OnceResult:
+        return score_once(frames, overlaps, names) if by_once else score_frames(frames, names, overlaps, levels)
+
+    results = score_rounds(score, classes, rounds)
     if not by_once:
-        return Evaluation(tuple(results), box_errors(frames, classes), precision)
+        return Evaluation(results, box_errors(frames, classes), precision)
     merged = [_merged(frame) for frame in frames]
     names = list(dict.fromkeys(once.SUPERCLASS_OF.get(name, name) for name in classes))
-    return Evaluation(tuple(results), box_errors(merged, names), precision)
+    return Evaluation(results, box_errors(merged, names), precision)
+
+
+def check_classes(classes: Sequence[str], rounds: Sequence[Mapping[str, float]], by_once: bool) -> None:
+    """Refuse classes that have no overlap, and overlaps that fit no class, before anything is detected.
+
+    Args:
+        classes: to score.
+        rounds: overlaps, as for :func:`evaluate_frames`.
+        by_once: by ONCE's rules instead of KITTI's.
+
+    Raises:
+        BeamboxError: naming the class.
+    """
+    nothing = KittiFrame(Labels.empty(), Detections.empty())
+    for number, overlaps in enumerate(rounds or ({},)):
+        wanted = list(overlaps) if number else classes
+        if by_once:
+            score_once([nothing], overlaps, wanted)
+        else:
+            score_frames([nothing], wanted, overlaps, levels=False)
 
 
 def _merged(frame: KittiFrame) -> KittiFrame:
