@@ -68,6 +68,7 @@ from beambox.ops.neighborhood import neighborhood_attention
 from beambox.ops.sparse_conv import Sites, SparseTensor, linear_keys
 from beambox.ops.voxelize import Voxels
 from beambox.structures.batch import Batch
+from beambox.structures.labels import Labels
 
 __all__ = [
     "DENNET_VOXELS",
@@ -215,8 +216,13 @@ class DenNet(TwoStage):
             channels += self.density.bev_channels(levels)
         self.backbone = AttentiveBackbone(channels, config)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> VoxelRcnnPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        With ``labels`` the second stage looks at regions drawn to learn from, without at the best proposals.
+        """
         grid = self.config.grid if grid is None else grid
         points = self.voxels(batch, grid)
         voxels = mean_voxels(points, self.config.absolute_xy)  # (V, columns)
@@ -225,7 +231,11 @@ class DenNet(TwoStage):
         if self.density is not None:
             maps = torch.cat((maps, self.density(voxels.sites, points)), dim=1)  # (B, 256 + 80, ny / 8, nx / 8)
         bev = self.backbone(maps)  # (B, 256, ny / 8, nx / 8)
-        return self.detect(stages, bev, grid)
+        first = self.head(bev, grid)
+        rois, targets = self.regions(first, labels)  # R boxes
+        pooled = self.roi_pool(rois, self.levels(stages), grid)  # (R, 6 * 6 * 6 * 96)
+        refined = self.roi_head(pooled)
+        return VoxelRcnnPredictions(first, rois, refined, targets)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:

@@ -206,8 +206,13 @@ class HCNet(nn.Module):
         )
         self.head = AnchorHead(self.adapt.out_channels, self.anchors)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> AnchorPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> AnchorPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        ``labels`` are for networks with a second step; they change nothing here.
+        """
         return self.from_voxels(self.voxels(batch, self.config.grid if grid is None else grid))
 
     def from_voxels(self, voxels: Voxels) -> AnchorPredictions:

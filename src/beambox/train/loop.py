@@ -68,7 +68,7 @@ class TrainStep(nn.Module):
 
     def forward(self, work: TrainingBatch) -> dict[str, Tensor]:
         """Return the named losses of a batch."""
-        predictions = self.detector(work.batch, work.grid)
+        predictions = self.detector(work.batch, work.grid, work.batch.labels)
         with torch.autocast(work.batch.points.device.type, enabled=False):
             return self.detector.loss(predictions, work.batch.labels)
 

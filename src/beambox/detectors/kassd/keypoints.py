@@ -179,17 +179,21 @@ class KeypointScores(nn.Module):
 
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, num_classes * count, Y, X)`` logits."""
-        return self.maps(bev)
+        *hidden, last = self.maps
+        for layer in hidden:
+            bev = layer(bev)  # (B, width, Y, X)
+        with torch.autocast(bev.device.type, enabled=False):  # scores are compared with each other: all their digits
+            return last(bev.float())
 
     def score(
-        self, maps: Tensor, grid: VoxelGrid, sample: int, boxes: Tensor, classes: Tensor, anchors: Tensor
+        self, maps: Tensor, grid: VoxelGrid, sample: Tensor, boxes: Tensor, classes: Tensor, anchors: Tensor
     ) -> Tensor:
-        """Score boxes of one sample: the mean of their keypoints' logits (KASSD, equation 5).
+        """Score boxes: the mean of their keypoints' logits (KASSD, equation 5).
 
         Args:
             maps: of :meth:`forward`.
             grid: the region the maps cover.
-            sample: position of the sample in the batch.
+            sample: ``(N,)`` int64 position of each box's sample in the batch.
             boxes: ``(N, 7)`` with resolved headings.
             classes: ``(N,)`` int64.
             anchors: ``(N, 2)`` x, y of the boxes' anchors.
@@ -200,5 +204,4 @@ class KeypointScores(nn.Module):
         at = map_coordinates(self.layout.points(boxes, anchors), grid, self.stride)  # (N, K, 2)
         count = self.layout.count
         channel = classes[:, None] * count + torch.arange(count, device=maps.device)  # (N, K)
-        which = torch.full_like(channel, sample)
-        return sample_bilinear(maps, which, channel, at).mean(dim=1)
+        return sample_bilinear(maps, sample[:, None], channel, at).mean(dim=1)
