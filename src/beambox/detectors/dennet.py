@@ -56,7 +56,14 @@ from beambox.detectors.voxel_rcnn import (
 )
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass
-from beambox.layers.bev import BN_EPS, BN_MOMENTUM, BevBackbone
+from beambox.layers.bev import (
+    BN_EPS,
+    BN_MOMENTUM,
+    conv_bn_relu,
+    deconv_bn_relu,
+    expect_levels_meet,
+    join_levels,
+)
 from beambox.layers.encoders import mean_voxels
 from beambox.layers.heads import PostProcess
 from beambox.layers.roi import ProposalLimits
@@ -240,8 +247,10 @@ class DenNet(TwoStage):
     @property
     def dense(self) -> tuple[nn.Module, ...]:
         """Layers that work on whole maps; neighbourhood attention has kernels of its own, which nothing can compile."""
-        layers = [layer for stage in self.backbone.stages for layer in stage.children()]
-        return (*(layer for layer in layers if not isinstance(layer, NeighborhoodBlock)), *self.backbone.ups)
+        stages = [stage for stage in self.backbone.stages if isinstance(stage, AttentiveStage)]
+        layers = [layer for stage in stages for layer in (*stage.convolutions, *stage.further)]
+        attentions = [stage.ca for stage in stages if isinstance(stage.ca, CoordinateAttention)]
+        return (*layers, *attentions, *self.backbone.ups)
 
 
 def patch_cells(radius: float, cell: Sequence[float]) -> float:
@@ -376,29 +385,62 @@ class DensityBranch(nn.Module):
         return count if self.max_count is None else count.clamp(max=self.max_count)
 
 
-class AttentiveBackbone(BevBackbone):
-    """Voxel R-CNN's 2-D network with both attentions in every stage (DenNet, section 3.3.2, figure 6).
-
-    ==========  ==================================================================================
-    stage       layers
-    ==========  ==================================================================================
-    1           6 convolutions 3 x 3 of 64 channels, NA of 64, CA of 64
-    2           6 convolutions 3 x 3 of 128 channels, the first of stride 2, NA of 128, CA of 128
-    3           both enlarged to 128 channels at the size of the first, joined
-    ==========  ==================================================================================
-    """
+class AttentiveBackbone(nn.Module):
+    """Voxel R-CNN's 2-D network with both attentions in every stage (DenNet, section 3.3.2, figure 6)."""
 
     def __init__(self, in_channels: int, config: DenNetConfig) -> None:
-        super().__init__(in_channels, config.depths, config.strides, config.widths, config.up_strides, config.up_widths)
-        for i, (width, heads) in enumerate(zip(config.widths, config.na_heads)):
-            layers = list(self.stages[i].children())
-            if config.na:
-                at = len(layers) // 2 if config.na_position is AttentionPosition.MIDDLE else len(layers)
-                block = NeighborhoodBlock(width, heads, config.na_window, config.na_mlp, config.na_ratio)
-                layers.insert(at, block)
-            if config.ca:
-                layers.append(CoordinateAttention(width, config.ca_reduction))
-            self.stages[i] = nn.Sequential(*layers)
+        super().__init__()
+        expect_levels_meet(config.strides, config.up_strides)
+        inputs = (in_channels, *config.widths[:-1])
+        self.stages = nn.ModuleList(AttentiveStage(inputs[i], config, i) for i in range(len(inputs)))
+        self.ups = nn.ModuleList(
+            deconv_bn_relu(width, up_width, up_stride, up_stride)
+            for width, up_width, up_stride in zip(config.widths, config.up_widths, config.up_strides)
+        )
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, 256, Y, X)``: stages downwards, all enlarged and joined."""
+        levels = []
+        for stage, up in zip(self.stages, self.ups):
+            bev = stage(bev)  # (B, 64, Y, X), then (B, 128, Y / 2, X / 2)
+            levels.append(up(bev))  # (B, 128, Y, X)
+        return join_levels(levels)
+
+
+class AttentiveStage(nn.Module):
+    """One stage of figure 6: six convolutions, neighbourhood attention, coordinate attention."""
+
+    def __init__(self, in_channels: int, config: DenNetConfig, stage: int) -> None:
+        super().__init__()
+        width, heads = config.widths[stage], config.na_heads[stage]
+        layers = [conv_bn_relu(in_channels, width, stride=config.strides[stage])]
+        layers += [conv_bn_relu(width, width) for _ in range(config.depths[stage])]
+        middle = config.na and config.na_position is AttentionPosition.MIDDLE
+        before = len(layers) // 2 if middle else len(layers)
+        self.convolutions = nn.Sequential(*layers[:before])
+        block = NeighborhoodBlock(width, heads, config.na_window, config.na_mlp, config.na_ratio) if config.na else None
+        self.na = block or nn.Identity()
+        self.further = nn.Sequential(*layers[before:])  # none, unless NA stands in the middle
+        self.ca = CoordinateAttention(width, config.ca_reduction) if config.ca else nn.Identity()
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, C, Y / s, X / s)``."""
+        bev = self.convolutions(bev)  # (B, C, Y / s, X / s)
+        bev = self.na(bev)
+        bev = self.further(bev)
+        return self.ca(bev)
+
+
+def names_since(config: DenNetConfig) -> dict[str, str]:
+    """Return what the layers of a stage were called in 0.1.0, where a stage was a flat list, and are called now."""
+    names: dict[str, str] = {}
+    for i, depth in enumerate(config.depths):
+        middle = config.na and config.na_position is AttentionPosition.MIDDLE
+        before = (depth + 1) // 2 if middle else depth + 1
+        now = [f"convolutions.{k}" for k in range(before)] + ["na"] * config.na
+        now += [f"further.{k}" for k in range(depth + 1 - before)] + ["ca"] * config.ca
+        names |= {f"backbone.stages.{i}.{k}.": f"backbone.stages.{i}.{name}." for k, name in enumerate(now)}
+    return names
 
 
 class NeighborhoodAttention(nn.Module):

@@ -47,7 +47,7 @@ from beambox.checks import BeamboxError, expect_shape
 from beambox.detectors.contract import detections_from, targets_from
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import AnchorClass, AnchorGrid
-from beambox.layers.bev import BN_EPS, BN_MOMENTUM, conv_bn_relu, deconv_bn_relu
+from beambox.layers.bev import BN_EPS, BN_MOMENTUM, conv_bn_relu, deconv_bn_relu, join_levels
 from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss, select_boxes
 from beambox.layers.pillars import PillarFeatures
 from beambox.ops.scatter import scatter_bev
@@ -382,9 +382,9 @@ class PyramidBackbone(nn.Module):
         top1 = self.block1(image)  # (B, 64, Y / 2, X / 2)
         top2 = self.block2(top1)  # (B, 128, Y / 4, X / 4)
         top3 = self.block3(top2)  # (B, 256, Y / 8, X / 8)
-        down2 = join(top2, self.deblock3(top3))  # (B, 256, Y / 4, X / 4)
-        down1 = join(top1, self.deblock2(down2))  # (B, 128, Y / 2, X / 2)
-        return join(self.up1(down1), self.up2(down2), self.up3(top3))  # (B, 384, Y / 2, X / 2)
+        down2 = join_levels((top2, self.deblock3(top3)))  # (B, 256, Y / 4, X / 4)
+        down1 = join_levels((top1, self.deblock2(down2)))  # (B, 128, Y / 2, X / 2)
+        return join_levels((self.up1(down1), self.up2(down2), self.up3(top3)))  # (B, 384, Y / 2, X / 2)
 
 
 @dataclass(frozen=True)
@@ -410,7 +410,7 @@ class OriginalFusion(nn.Module):
 
     def forward(self, bev: Tensor, image: Tensor) -> Tensor:
         """Map ``(B, channels, Y / s, X / s)`` and the image ``(B, C, Y, X)`` to ``(B, out_channels, Y / s, X / s)``."""
-        return self.weigh(join(bev, self.shrink(image)))
+        return self.weigh(join_levels((bev, self.shrink(image))))
 
 
 class AdaptiveHead(nn.Module):
@@ -444,7 +444,7 @@ class AdaptiveHead(nn.Module):
         bev = bev if self.fuse1 is None else self.fuse1(bev, image)  # (B, 384 + 64, Y / 2, X / 2)
         deep = self.block(bev)  # (B, 128, Y / 4, X / 4)
         deep = deep if self.fuse2 is None else self.fuse2(deep, image)  # (B, 128 + 64, Y / 4, X / 4)
-        both = join(self.skip(bev), self.deblock(deep))  # (B, 256, Y / 2, X / 2)
+        both = join_levels((self.skip(bev), self.deblock(deep)))  # (B, 256, Y / 2, X / 2)
         return both if self.adjust is None else self.adjust(both)
 
 
@@ -515,12 +515,6 @@ def block(in_channels: int, width: int, depth: int, stride: int) -> nn.Sequentia
 def deblock(in_channels: int, width: int, stride: int) -> nn.Sequential:
     """A transposed 3 x 3 convolution that undoes a stride."""
     return deconv_bn_relu(in_channels, width, 3, stride, padding=1, output_padding=stride - 1)
-
-
-def join(first: Tensor, *others: Tensor) -> Tensor:
-    """Join maps along the channels, cut to the first one's size (an odd size halved and doubled is one larger)."""
-    height, width = first.shape[-2:]
-    return torch.cat([first, *(other[..., :height, :width] for other in others)], dim=1)
 
 
 def hcnet(config: HCNetConfig | None = None) -> HCNet:
