@@ -32,9 +32,7 @@ def test_evaluation_refines_every_proposal():
         assert len(predictions.refined.cls) == len(predictions.rois.boxes) <= 20
         detections = small.decode(predictions)
         to_learn = small(batch, labels=batch.labels)
-        assert len(to_learn.refined.cls) == 2 * TWO_STAGES["sampling"].per_sample, (
-            "those drawn to learn from"
-        )
+        assert len(to_learn.refined.cls) == 2 * TWO_STAGES["sampling"].per_sample, "those drawn to learn from"
         assert set(small.loss(to_learn, batch.labels)) >= {"cls", "roi_cls"}
     assert len(detections) == 2
     assert all(d.classes == ("Car",) for d in detections)

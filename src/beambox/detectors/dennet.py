@@ -45,7 +45,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from beambox.checks import BeamboxError, expect_same_length, expect_shape
+from beambox.checks import BeamboxError, choose_fields, chosen, expect_same_length, expect_shape
 from beambox.detectors.second import KITTI_VOXELS, ONCE_VOXELS
 from beambox.detectors.voxel_rcnn import (
     COARSE_POOLING,
@@ -178,6 +178,7 @@ class DenNetConfig(VoxelRcnnConfig):
     """Channels over hidden channels, of which there are at least 8 (Hou et al. 2021)."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         super().__post_init__()
         expect_same_length(widths=len(self.widths), na_heads=len(self.na_heads))
         if self.na_window < 1 or self.na_window % 2 == 0:
@@ -258,8 +259,9 @@ def patch_cells(radius: float, cell: Sequence[float]) -> float:
     return math.pi * radius * radius / (cell[0] * cell[1])
 
 
-def normalised(count: Tensor, radius: float, cell: Sequence[float], how: Normalisation) -> Tensor:
+def normalised(count: Tensor, radius: float, cell: Sequence[float], how: Normalisation | str) -> Tensor:
     """Turn counts ``(V,)`` within a radius into float32 features ``(V,)``."""
+    how = chosen("how", how, Normalisation)
     count, full = count.float(), patch_cells(radius, cell)
     if how is Normalisation.LOG_SHARE:
         return torch.log1p(count) / math.log1p(full)
@@ -309,8 +311,8 @@ class DensityBranch(nn.Module):
         self,
         radii: Sequence[float] = (0.6, 1.8),
         depth: int = 16,
-        count_set: CountSet = CountSet.VOXELS,
-        normalisation: Normalisation = Normalisation.LOG_SHARE,
+        count_set: CountSet | str = CountSet.VOXELS,
+        normalisation: Normalisation | str = Normalisation.LOG_SHARE,
         max_count: int | None = None,
         own_points: int | None = None,
         collapse: bool = False,
@@ -332,8 +334,8 @@ class DensityBranch(nn.Module):
         if max_count is not None and max_count < 1:
             raise BeamboxError(f"`max_count` must be at least 1 (a voxel counts itself), or none; got {max_count}")
         self.radii = tuple(radii)
-        self.count_set = count_set
-        self.normalisation = normalisation
+        self.count_set = chosen("count_set", count_set, CountSet)
+        self.normalisation = chosen("normalisation", normalisation, Normalisation)
         self.max_count = max_count
         self.own_points = own_points
         self.depth = depth

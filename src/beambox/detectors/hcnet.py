@@ -43,7 +43,7 @@ from enum import Enum
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError, expect_shape
+from beambox.checks import BeamboxError, choose_fields, chosen, expect_shape
 from beambox.detectors.contract import detections_from, targets_from
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import AnchorClass, AnchorGrid
@@ -159,6 +159,7 @@ class HCNetConfig:
     """Post-processing at test time."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         if not self.anchors:
             raise BeamboxError("`anchors` must name at least one class, got none")
         of_stages = {"depths": self.depths, "strides": self.strides, "widths": self.widths, "up_widths": self.up_widths}
@@ -315,10 +316,15 @@ class HeightChannelFusion(nn.Module):
     """
 
     def __init__(
-        self, channels: int, slices: int, kind: HeightChannelKind, height_hidden: int = 4, channel_hidden: int = 16
+        self,
+        channels: int,
+        slices: int,
+        kind: HeightChannelKind | str,
+        height_hidden: int = 4,
+        channel_hidden: int = 16,
     ) -> None:
         super().__init__()
-        self.kind = kind
+        self.kind = kind = chosen("kind", kind, HeightChannelKind)
         self.slices = slices
         uses_height = kind in (HeightChannelKind.HEIGHT, HeightChannelKind.BOTH)
         uses_channel = kind in (HeightChannelKind.CHANNEL, HeightChannelKind.BOTH)
@@ -479,11 +485,11 @@ class AdaptiveAdjustment(nn.Module):
     Rows and columns are averaged over the whole map, so the answer at a place depends on the region.
     """
 
-    def __init__(self, channels: int, gate: Gate = Gate.RELU, kernel: int = 3) -> None:
+    def __init__(self, channels: int, gate: Gate | str = Gate.RELU, kernel: int = 3) -> None:
         super().__init__()
         if kernel % 2 == 0:
             raise BeamboxError(f"`kernel` must be odd, so that rows and columns keep their number, got {kernel}")
-        self.gate = gate
+        self.gate = gate = chosen("gate", gate, Gate)
         self.rows = strip_conv(channels, (kernel, 1), gate)
         self.columns = strip_conv(channels, (1, kernel), gate)
 

@@ -121,8 +121,12 @@ def test_maps_that_hold_their_column_or_row_score_its_mean() -> None:
     rows = torch.arange(200, dtype=torch.float64)[:, None].expand(1, 31, 200, 176)
     at = map_coordinates(kam.layout.points(boxes, anchors), KITTI, 8)
     classes = torch.zeros(50, dtype=torch.int64)
-    torch.testing.assert_close(kam.score(columns, KITTI, torch.tensor([0]), boxes, classes, anchors), at[..., 0].mean(dim=1))
-    torch.testing.assert_close(kam.score(rows, KITTI, torch.tensor([0]), boxes, classes, anchors), at[..., 1].mean(dim=1))
+    torch.testing.assert_close(
+        kam.score(columns, KITTI, torch.tensor([0]), boxes, classes, anchors), at[..., 0].mean(dim=1)
+    )
+    torch.testing.assert_close(
+        kam.score(rows, KITTI, torch.tensor([0]), boxes, classes, anchors), at[..., 1].mean(dim=1)
+    )
 
 
 def test_each_point_reads_its_own_map_of_its_class_and_sample() -> None:

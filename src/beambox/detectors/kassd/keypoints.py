@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, choose_fields
 from beambox.geometry.boxes import rotate_z
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.bev import conv_bn_relu
@@ -59,6 +59,7 @@ class KeypointLayout:
     """Which point joins the inner ones."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         if (self.m, self.n) != (0, 0) and min(self.m, self.n) < 2:
             raise BeamboxError(f"`m` and `n` count both corners: at least 2 each, or 0 both, got {self.m} and {self.n}")
         if (self.d, self.e) != (0, 0) and min(self.d, self.e) < 1:

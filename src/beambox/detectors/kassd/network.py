@@ -40,7 +40,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, choose_fields, chosen
 from beambox.detectors.contract import detections_from, expect_made, targets_from
 from beambox.detectors.kassd.keypoints import KeypointLayout, KeypointScores
 from beambox.detectors.kassd.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
@@ -135,6 +135,9 @@ class KamOptions:
     score: KamScore = KamScore.REPLACE
     """What becomes of the score at test time: replace or multiply the class score."""
 
+    def __post_init__(self) -> None:
+        choose_fields(self)
+
 
 @dataclass(frozen=True)
 class KassdConfig:
@@ -190,6 +193,7 @@ class KassdConfig:
     """Post-processing at test time."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         if not self.anchors:
             raise BeamboxError("`anchors` must name at least one class, got none")
         if not self.llm and self.neck not in (Neck.LLM, Neck.SECOND):
@@ -396,7 +400,7 @@ class Kassd(nn.Module):
         return kept
 
 
-def location_attention(high: Tensor, low: Tensor, reduce: LamReduce = LamReduce.SUM) -> Tensor:
+def location_attention(high: Tensor, low: Tensor, reduce: LamReduce | str = LamReduce.SUM) -> Tensor:
     """Join two maps by a softmax over the pair at every place (LAM; KASSD, equations 1 and 2).
 
     ``(p0, p1) = softmax(sum_c high, sum_c low)``, output ``p0 * high + p1 * low``. It has no parameters.
@@ -409,6 +413,7 @@ def location_attention(high: Tensor, low: Tensor, reduce: LamReduce = LamReduce.
     Returns:
         ``(B, C, Y, X)``.
     """
+    reduce = chosen("reduce", reduce, LamReduce)
     difference = (high - low).sum(dim=1, keepdim=True, dtype=torch.promote_types(high.dtype, torch.float32))
     if reduce is LamReduce.MEAN:
         difference = difference / high.shape[1]
@@ -469,12 +474,12 @@ class LocationAttention(nn.Module):
         width: int = 128,
         reuse: bool = True,
         lam: bool = True,
-        reduce: LamReduce = LamReduce.SUM,
+        reduce: LamReduce | str = LamReduce.SUM,
         context: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.levels = FeatureReuse(in_channels, width, reuse, context)
-        self.lam, self.reduce = lam, reduce
+        self.lam, self.reduce = lam, chosen("reduce", reduce, LamReduce)
         self.out_channels = width
 
     def forward(self, bev: Tensor) -> Tensor:
