@@ -12,7 +12,6 @@ from torch import nn
 import beambox.detectors.voxel_rcnn
 from beambox.checks import BeamboxError
 from beambox.detectors.catalogue import CATALOGUE, build, config_to_dict
-from beambox.detectors.hcnet import HeightChannelFusion
 from beambox.detectors.weights import load_weights, save_weights
 from beambox.infer.fusion import fold_batch_norms
 from beambox.layers.roi import Rois, propose
@@ -88,11 +87,6 @@ def test_losses_reach_every_parameter(variant: str, monkeypatch: pytest.MonkeyPa
     name = variant.split(":", maxsplit=1)[0]
     config = VARIANTS[variant]
     model = made(name, config)
-    for layer in model.modules():
-        if isinstance(layer, HeightChannelFusion):
-            for key, parameter in layer.named_parameters():
-                if key.endswith("bias"):
-                    nn.init.constant_(parameter, 0.5)  # so that no ReLU of the attention is shut from the start
     batch = Batch.of([car_frame(5, CAR), car_frame(6)])
 
     def some_found_the_car(*arguments: Any) -> Rois:

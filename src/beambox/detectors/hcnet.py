@@ -363,8 +363,17 @@ class HeightChannelFusion(nn.Module):
 
 
 def two_pointwise(width: int, hidden: int) -> nn.Sequential:
-    """Two 1 x 1 convolutions with ReLU, on the last axis; the result is at least 0."""
-    return nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, width), nn.ReLU())
+    """Two 1 x 1 convolutions with ReLU, on the last axis; the result is at least 0.
+
+    The paper names no initialisation, and PyTorch's shuts a ReLU for good in every second network: inputs are not
+    negative, so a unit whose few weights and bias came out negative gives 0 and no gradient, whatever it sees. Both
+    start open here, hidden units by a bias of 0.5, results near 1: all slices and channels weigh sigmoid(1) = 0.73.
+    """
+    first, last = nn.Linear(width, hidden), nn.Linear(hidden, width)
+    nn.init.constant_(first.bias, 0.5)
+    nn.init.normal_(last.weight, std=0.05)
+    nn.init.ones_(last.bias)
+    return nn.Sequential(first, nn.ReLU(), last, nn.ReLU())
 
 
 class PyramidBackbone(nn.Module):

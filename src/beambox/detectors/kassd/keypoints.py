@@ -175,6 +175,7 @@ class KeypointScores(nn.Module):
             conv_bn_relu(width, width),
             nn.Conv2d(width, num_classes * layout.count, 1),
         )
+        nn.init.normal_(self.maps[-1].weight, std=0.01)  # pyright: ignore[reportArgumentType]
         prior = 0.01  # as in the anchor head: a fresh network calls one box in a hundred good
         nn.init.constant_(self.maps[-1].bias, -math.log((1 - prior) / prior))  # pyright: ignore[reportArgumentType]
 

@@ -262,6 +262,7 @@ class Kassd(nn.Module):
         self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
         self.neck = make_neck(config, self.encoder.bev_channels(config.grid.shape[0]))
         self.head = AnchorHead(self.neck.out_channels, self.anchors)
+        nn.init.normal_(self.head.cls.weight, std=0.01)  # behind LLM, default weights would spread the prior of 0.01
         self.kam = (
             KeypointScores(self.neck.out_channels, config.keypoints, STRIDE, len(config.anchors), config.kam_width)
             if config.kam
@@ -481,6 +482,20 @@ class LocationAttention(nn.Module):
         self.levels = FeatureReuse(in_channels, width, reuse, context)
         self.lam, self.reduce = lam, chosen("reduce", reduce, LamReduce)
         self.out_channels = width
+        if lam and self.reduce is LamReduce.SUM:
+            self.open_lam(width)
+
+    def open_lam(self, width: int) -> None:
+        """Start with levels whose channel sums differ by about 1, so that both learn.
+
+        The paper names no initialisation. By PyTorch's, the sums over 128 channels differ by 88 at the start, the
+        softmax is 1 and 0 to the last bit, and F4 gets no gradient until it happens to win somewhere. Both
+        deconvolutions start alike, so that they cancel, and F0 and F1, which are left, start small: 2 / c.
+        """
+        levels = self.levels
+        levels.up_low.load_state_dict(levels.up_high.state_dict())
+        for block in (levels.reduce, levels.three[-1]):
+            nn.init.constant_(block[1].weight, 2 / width)  # pyright: ignore
 
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, width, Y, X)``."""
