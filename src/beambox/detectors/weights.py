@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import build, config_to_dict, name_of
+from beambox.detectors.catalogue import build, config_to_dict, name_of, tensors_since
 from beambox.io import write_bytes
 
 __all__ = ["WeightFile", "load_weights", "read_weights", "save_weights"]
@@ -113,7 +113,7 @@ def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
     Raises:
         BeamboxError: naming the first tensor that is missing, unknown or of another shape.
     """
-    own = model.state_dict()
+    own, tensors = model.state_dict(), tensors_since(model, tensors)
     missing, unknown = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
     if missing or unknown:
         said = [f"lacks {missing[0]} and {len(missing) - 1} more"] if missing else []
