@@ -7,7 +7,6 @@ import torch
 from safetensors.torch import save_file
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors import weights
 from beambox.detectors.catalogue import build, config_from_dict, config_to_dict
 from beambox.detectors.pointpillars import PointPillarsConfig
 from beambox.detectors.voxel_rcnn import VoxelRcnnConfig
@@ -79,7 +78,7 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path: Path, monkeypatch: pyte
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(weights.os, "fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(BeamboxError, match="No space left on device"):
         save_weights(path, model)
     assert path.read_bytes() == before

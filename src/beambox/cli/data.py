@@ -45,8 +45,8 @@ def check(
     from beambox.data.checking import check_frames
     from beambox.data.custom import CustomSource
     from beambox.data.custom_config import KITTI_GROUND
-    from beambox.data.files import write_text
     from beambox.data.opening import open_data
+    from beambox.io import write_text
 
     source = open_data(data, split)
     limits, ground = None, None

@@ -38,14 +38,11 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     Data without a camera have no difficulty levels: every object counts, and each class has one AP. Data of one's own
     are looked at within the range that their YAML file names.
     """
-    import json
-
     from beambox.cli.console import progress
     from beambox.data.custom import CustomSource
     from beambox.data.custom_config import KITTI_GROUND
     from beambox.data.once import OnceSource
     from beambox.data.opening import open_data
-    from beambox.detectors.weights import write_atomically
     from beambox.infer.evaluate import (
         detect_frames,
         parse_overlaps,
@@ -55,6 +52,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         write_results,
     )
     from beambox.infer.predictor import load
+    from beambox.io import write_json
 
     overlaps = parse_overlaps(iou or [])
     source = open_data(data, split)
@@ -86,4 +84,4 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         tables.append(scored.to_json())
     numbers = {"default": tables[0], "given": tables[1]} if overlaps else tables[0]
     if json_file is not None:
-        write_atomically(json_file, (json.dumps(numbers, indent=2) + "\n").encode())
+        write_json(json_file, numbers, indent=2)

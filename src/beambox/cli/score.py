@@ -43,7 +43,7 @@ def write_json(path: Path, content: Any) -> None:
     """Write numbers for other programs."""
     import json
 
-    from beambox.data.files import write_text
+    from beambox.io import write_text
 
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 

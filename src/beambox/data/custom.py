@@ -24,13 +24,13 @@ from beambox.data.box_files import (
     parse_kitti_boxes,
 )
 from beambox.data.custom_config import CustomConfig, read_custom_config
-from beambox.data.files import read_text
 from beambox.data.kitti_text import read_calibration
 from beambox.data.names import NameList
 from beambox.data.reading import read_frame
 from beambox.data.road import fit_road_plane
 from beambox.geometry.axes import Axes, turn_boxes
 from beambox.geometry.boxes import wrap_angle
+from beambox.io import read_text
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.structures import Frame, Labels
 

@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.files import read_text
 from beambox.geometry.axes import Axes, level_shift
+from beambox.io import read_text
 
 __all__ = ["KITTI_GROUND", "CustomConfig", "GroundSlope", "read_custom_config"]
 

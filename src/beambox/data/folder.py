@@ -21,8 +21,8 @@ from pathlib import Path
 import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
-from beambox.data.files import read_text
 from beambox.data.reading import SUFFIXES, read_frame
+from beambox.io import read_text
 from beambox.structures import Frame, Labels
 
 __all__ = ["FolderSource", "format_boxes", "parse_boxes"]

@@ -22,7 +22,6 @@ from pathlib import Path
 import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
-from beambox.data.files import read_text, write_bytes, write_text
 from beambox.data.formats.binary import read_bin
 from beambox.data.kitti_text import (
     CALIBRATION_REMEDY,
@@ -37,6 +36,7 @@ from beambox.data.kitti_text import (
     read_results,
 )
 from beambox.geometry import Calibration
+from beambox.io import read_text, write_bytes, write_text
 from beambox.structures import Frame, Labels
 
 __all__ = [

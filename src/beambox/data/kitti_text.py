@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.files import read_text
 from beambox.geometry import Calibration
+from beambox.io import read_text
 from beambox.structures import Detections, ImageAttributes, Labels
 
 __all__ = [

@@ -25,9 +25,9 @@ import torch
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
-from beambox.data.files import read_bytes, read_text, write_bytes, write_text
 from beambox.data.names import NameList
 from beambox.data.reading import read_frame
+from beambox.io import read_bytes, read_text, write_bytes, write_text
 from beambox.structures import Frame, Labels
 
 __all__ = ["ONCE_CLASSES", "OnceSource", "write_once_sequence", "write_once_split"]

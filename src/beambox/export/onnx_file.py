@@ -25,9 +25,9 @@ from beambox.checks import BeamboxError
 from beambox.detectors.catalogue import config_to_dict, name_of
 from beambox.detectors.hcnet import HCNet
 from beambox.detectors.pointpillars import PointPillars, PointPillarsConfig
-from beambox.detectors.weights import write_atomically
 from beambox.export.onnx_check import TOLERANCE, Differences, compare, runtime_is_there, synthetic_sweep
 from beambox.geometry.grid import VoxelGrid
+from beambox.io import write_bytes
 from beambox.ops.voxelize import Voxels
 
 __all__ = ["OPSETS", "DenseGraph", "Written", "export_onnx"]
@@ -125,7 +125,7 @@ def export_onnx(
         for name, points in {**everything, **(sweeps or {})}.items():
             checks.append(compare(content, detector, points, name))
             expect_agreement(checks[-1])
-    write_atomically(path, content)
+    write_bytes(path, content, sync=True)
     return Written(path, len(content), shapes(proto.graph.input), shapes(proto.graph.output), tuple(checks))
 
 

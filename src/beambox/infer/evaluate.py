@@ -11,6 +11,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
+from beambox.io import check_file_name, write_text
 from beambox.metrics import once
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
@@ -141,7 +142,5 @@ def write_results(folder: Path, frames: Sequence[KittiFrame]) -> None:
                 "use `beambox detect --format json`"
             )
         text = frame.detections.to_kitti(frame.calibration, frame.image_size)
-        path = folder / f"{frame.detections.frame_id}.txt"
-        temporary = path.with_name(f".{path.name}.part")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+        name = check_file_name(frame.detections.frame_id, "a result file")
+        write_text(folder / f"{name}.txt", text)

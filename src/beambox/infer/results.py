@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.files import read_text, write_text
 from beambox.data.kitti import read_results
+from beambox.io import read_text, write_text
 from beambox.structures import Detections, Frame
 
 __all__ = ["FORMATS", "choose_formats", "find_result", "read_result", "write_results"]

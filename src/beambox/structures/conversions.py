@@ -19,6 +19,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.geometry.calibration import Calibration
+from beambox.io import write_bytes, write_text
 
 if TYPE_CHECKING:
     import supervision
@@ -94,8 +95,6 @@ def save_frame(frame: Frame, path: Path) -> Path:
     ending = path.suffix.lower()
     if ending not in (".bin", ".npy"):
         return _save_picture(path, frame, None, frame.labels, ".bin, .npy")
-    from beambox.data.files import write_bytes
-
     content = io.BytesIO()
     points = frame.points.detach().cpu().numpy()
     if ending == ".npy":
@@ -123,8 +122,6 @@ def _save_picture(
 
 
 def _write(path: Path, text: str) -> Path:
-    from beambox.data.files import write_text
-
     write_text(path, text)
     return path
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from io import StringIO
 from typing import TYPE_CHECKING, Any
 
+from beambox import io
 from beambox.checks import BeamboxError
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def json_text(rows: Sequence[Row], head: Mapping[str, Any], under: str) -> str:
 
 def csv_text(rows: Iterable[Row], columns: Sequence[str]) -> str:
     """Write rows below a header line."""
-    text = io.StringIO()
+    text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows([row[key] for key in columns] for row in rows)
@@ -62,7 +63,7 @@ def parse_csv(text: str, where: str, columns: Sequence[str]) -> list[dict[str, A
         BeamboxError: naming the line.
     """
     try:
-        reader = csv.DictReader(io.StringIO(text))
+        reader = csv.DictReader(StringIO(text))
         lacking = [key for key in columns if key not in (reader.fieldnames or ())]
         if lacking:
             raise BeamboxError(f"{where} needs a header line with the columns {','.join(columns)}; {lacking[0]} lacks")
@@ -79,10 +80,7 @@ def parse_json(
     Raises:
         BeamboxError: naming the entry.
     """
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise BeamboxError(f"{where} is no JSON: {error}") from None
+    content = io.parse_json(text, where)
     rows = content.get(under) if isinstance(content, dict) else None
     if not isinstance(rows, list):
         raise BeamboxError(f'{where} must hold an object with a list under "{under}", as beambox writes it')

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from beambox.checks import BeamboxError
+from beambox.io import replacing
 from beambox.visualise.colours import Colour
 
 __all__ = ["SUPER", "Canvas", "save_picture"]
@@ -105,13 +105,8 @@ def save_picture(picture: Image.Image, path: Path) -> None:
     kind = kinds.get(path.suffix.lower())
     if kind is None:
         raise BeamboxError(f"a picture is written as .png or .jpg, got the name {path.name}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        picture.save(draft, format=kind)
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with replacing(path) as stream:
+        picture.save(stream, format=kind)
 
 
 def _drawn(points: Sequence[Point]) -> list[Point]:

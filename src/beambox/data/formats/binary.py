@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from beambox.checks import BeamboxError
-from beambox.data.files import read_bytes
+from beambox.io import read_bytes
 
 __all__ = ["read_bin"]
 
