@@ -145,7 +145,7 @@ def test_a_recording_is_opened_once_for_all_its_sweeps(
         monkeypatch.setattr(AnyReader, name, lambda self, real=real, calls=calls: (calls.append(self), real(self))[1])
     detector = Detector(tiny_model(), device="cpu", precision="float32")
     assert [found.frame_id for found in detector.stream(path)] == ["1000000000", "1100000000", "1200000000"]
-    assert len(opened) == 1 and closed == opened
+    assert len(opened) == 1 and closed[-1:] == opened
     assert len(detector(path)) == 3 and len(detector([path, path / "lidar" / "top" / "1100000000"])) == 4
     assert detector(path / "lidar" / "top" / "1100000000").frame_id == "1100000000"
 

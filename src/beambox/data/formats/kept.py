@@ -53,8 +53,9 @@ def close_kept() -> None:
 
 
 def _state(root: Path) -> Iterator[object]:
-    """Yield what changes where a recording is written anew."""
+    """Yield what changes where a recording is written anew; what SQLite lays beside its file does not count."""
     yield root.resolve()
     for path in sorted(root.iterdir()) if root.is_dir() else [root]:
-        status = path.stat()
-        yield from (path.name, status.st_size, status.st_mtime_ns, status.st_ino)
+        if path.suffix.lower() in (".bag", ".mcap", ".db3", ".yaml"):
+            status = path.stat()
+            yield from (path.name, status.st_size, status.st_mtime_ns, status.st_ino)
