@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from beambox import __version__
-from beambox.checks import BeamboxError, did_you_mean, expect_same_length, expect_shape
+from beambox.checks import BeamboxError, did_you_mean, expect_same_length, expect_shape, printable
 from beambox.geometry.boxes import corners_3d
 from beambox.geometry.calibration import Calibration
 from beambox.structures import conversions, rows
@@ -130,7 +130,7 @@ class Detections:
 
     def __repr__(self) -> str:
         best = f"; best {float(self.scores.max()):.2f}" if len(self) else ""
-        frame = f"; frame {self.frame_id[:60]}" if self.frame_id else ""
+        frame = f"; frame {printable(self.frame_id[:60])}" if self.frame_id else ""
         return f"Detections({len(self)}: {rows.counted(self.names)}{best}{frame})"
 
     def _repr_html_(self) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 import torch
 from torch import Tensor
 
-from beambox.checks import BeamboxError, expect_dtype
+from beambox.checks import BeamboxError, expect_dtype, printable
 from beambox.geometry.calibration import Calibration
 from beambox.structures import conversions, rows
 from beambox.structures.detections import Detections
@@ -130,7 +130,7 @@ class Frame:
         parts += [f"{len(self.labels)} labels"] if self.labels is not None else []
         parts += ["calibration"] if self.calibration is not None else []
         parts += ["image"] if self.image_path is not None else []
-        return f"Frame({self.id[:60] or 'unnamed'}: {', '.join(parts)})"
+        return f"Frame({printable(self.id[:60]) or 'unnamed'}: {', '.join(parts)})"
 
     def _repr_html_(self) -> str:
         """Show a bird's-eye view in a notebook."""

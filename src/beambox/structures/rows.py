@@ -11,7 +11,7 @@ from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 from beambox import io
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -130,6 +130,6 @@ def _pandas() -> Any:
 
 def counted(names: Sequence[str]) -> str:
     """Count names, most frequent first, such as "3 Car, 1 Van"; "nothing" where there is none."""
-    shown = [f"{number} {name[:40]}" for name, number in Counter(names).most_common(6)]
+    shown = [f"{number} {printable(name[:40])}" for name, number in Counter(names).most_common(6)]
     more = len(set(names)) - len(shown)
     return (", ".join(shown) + (f" and {more} other classes" if more > 0 else "")) or "nothing"
