@@ -242,7 +242,7 @@ def _parse_rows(text: str, where: str, columns: tuple[int, ...]) -> _Rows:
         values = _numbers(words[1:], place)
         if max(map(abs, values)) > FARTHEST:
             raise BeamboxError(f"{place}: expected metres, pixels and radians, got {max(values, key=abs):g}")
-        if words[0] == DONT_CARE:
+        if words[0].lower() == DONT_CARE.lower():
             ignored.append(values[3:7])
             continue
         if min(values[7:10]) < 0:
