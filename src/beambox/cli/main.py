@@ -100,8 +100,9 @@ def explain(error: OSError) -> str:
 
 def stop(message: str, status: int) -> NoReturn:
     """Print one line on stderr and leave."""
-    line = " ".join(message.split())
-    print(f"beambox: {line}", file=sys.stderr)
+    from beambox.cli.console import say
+
+    say("beambox: " + " ".join(message.split()))
     raise SystemExit(status)
 
 
@@ -145,7 +146,10 @@ def run(name: str, arguments: Sequence[str]) -> None:
         app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         settings = {"help_option_names": ["-h", "--help"]}
         app.command(name, help=help_of(command), context_settings=settings)(guard(command))
-    app(args=list(arguments), prog_name=f"beambox {name}")
+    from beambox.cli.console import plain_output
+
+    with plain_output():
+        app(args=list(arguments), prog_name=f"beambox {name}")
 
 
 def help_of(function: Callable[..., None]) -> str:
