@@ -18,7 +18,8 @@ import torch
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.box_files import CAMERA_AT_THE_SENSOR
 from beambox.data.custom import CustomSource
-from beambox.data.kitti_text import format_calibration, format_labels
+from beambox.data.kitti_calibration import format_calibration
+from beambox.data.kitti_text import format_labels
 from beambox.data.opening import open_data
 from beambox.data.source import FrameSource
 from beambox.structures import Labels

@@ -24,7 +24,7 @@ from beambox.data.box_files import (
     parse_kitti_boxes,
 )
 from beambox.data.custom_config import CustomConfig, read_custom_config
-from beambox.data.kitti_text import read_calibration
+from beambox.data.kitti_calibration import read_calibration
 from beambox.data.names import NameList
 from beambox.data.reading import read_frame
 from beambox.data.road import fit_road_plane

@@ -22,7 +22,7 @@ import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.reading import SUFFIXES, read_frame
-from beambox.io import read_text
+from beambox.io import name_to_word, read_names, read_text, word_to_name
 from beambox.structures import Frame, Labels
 
 __all__ = ["FolderSource", "format_boxes", "parse_boxes"]
@@ -97,10 +97,7 @@ def _names(sets: Path, split: str) -> list[str]:
     if not listing.exists():
         known = [*(path.stem for path in sets.glob("*.txt")), "all"]
         raise MissingFileError(f'{listing} is not there: no split "{split}"{did_you_mean(split, known)}')
-    names = read_text(listing).split()
-    if not names:
-        raise BeamboxError(f"{listing} must name the frames of the split, one a line, but is empty")
-    return names
+    return read_names(listing)
 
 
 def parse_boxes(text: str, where: str = "labels") -> Labels:
@@ -130,7 +127,7 @@ def parse_boxes(text: str, where: str = "labels") -> Labels:
             )
         if min(values[3:6]) < 0:
             raise BeamboxError(f"{where}, line {number}: l, w and h must be at least 0, got {' '.join(words[4:7])}")
-        names.append(words[0])
+        names.append(word_to_name(words[0]))
         rows.append(values)
     return Labels(torch.tensor(rows, dtype=torch.float32).reshape(-1, 7), tuple(names))
 
@@ -138,6 +135,6 @@ def parse_boxes(text: str, where: str = "labels") -> Labels:
 def format_boxes(labels: Labels) -> str:
     """Write lines of ``class x y z l w h yaw``; inverse of :func:`parse_boxes` to a tenth of a millimetre."""
     return "".join(
-        " ".join([name, *(f"{value:.4f}" for value in box)]) + "\n"
+        " ".join([name_to_word(name), *(f"{value:.4f}" for value in box)]) + "\n"
         for name, box in zip(labels.names, labels.boxes.tolist())
     )

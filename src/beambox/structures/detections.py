@@ -10,6 +10,7 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_same_length, expect_shape
 from beambox.geometry.calibration import Calibration
+from beambox.io import name_to_word
 
 __all__ = ["Detections"]
 
@@ -85,7 +86,7 @@ class Detections:
             dim=1,
         )  # (N, 13)
         lines = (
-            f"{name} -1 -1 " + " ".join(f"{value:.4f}" for value in row) + "\n"
+            f"{name_to_word(name)} -1 -1 " + " ".join(f"{value:.4f}" for value in row) + "\n"
             for name, row in zip(self.names, columns.tolist())
         )
         return "".join(lines)

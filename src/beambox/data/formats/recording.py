@@ -95,7 +95,7 @@ def read_message(path: Path) -> Columns:
         with _reader(root) as reader:
             wanted = [one for one in reader.connections if one.topic.strip("/") == topic]
             time, number = stamp
-            messages = reader.messages(wanted, start=time, stop=time + 1) if wanted else iter(())
+            messages: Any = reader.messages(wanted, start=time, stop=time + 1) if wanted else ()
             for connection, _, raw in itertools.islice(messages, number - 1, None):
                 return cloud_columns(reader.deserialize(raw, connection.msgtype), str(path))
         which = f"{time} ns" if number == 1 else f"{time} ns, the {number}th at that time"
