@@ -47,6 +47,7 @@ MOST_NODES = 100_000
 """Values that a YAML file may stand for once its aliases are written out."""
 LONGEST_NAME = 200
 """Bytes of a name; file systems take 255, and endings are added."""
+PLAIN_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,190}")  # what nearly all names are, told quickly
 ABANDONED = 86_400
 """A draft whose writer cannot be asked after is left over once it is older than this many seconds."""
 DRAFT = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<pid>[0-9]+)-[0-9a-f]{8}\.part")
@@ -227,6 +228,8 @@ def check_file_name(name: object, where: str) -> str:
     Raises:
         BeamboxError: if it is empty, no text, ``.`` or ``..``, too long, or holds a separator or a control character.
     """
+    if isinstance(name, str) and PLAIN_NAME.fullmatch(name):
+        return name
     if not isinstance(name, str):
         raise BeamboxError(f"{where}: a name must be text, got {type(name).__name__}")
     fault = None

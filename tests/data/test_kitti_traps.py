@@ -54,7 +54,7 @@ def test_a_named_split_without_lists_is_refused(tmp_path: Path) -> None:
     make(tmp_path)
     for split in ("train", "val", "trainval"):
         with pytest.raises(
-            MissingFileError, match="`beambox data splits .*writes KITTI's usual lists of 3712 and 3769"
+            MissingFileError, match=r"`beambox data splits .*writes KITTI's usual lists of 3712 and 3769"
         ):
             KittiSource(tmp_path, split)
     assert len(KittiSource(tmp_path, "all")) == 3

@@ -17,7 +17,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Look at a data set: read all of it and say what seems wrong, propose anchors, count the points of voxels, write lists.",
+    help="Look at a data set: read all of it and say what seems wrong, propose anchors, count points, write lists.",
 )
 
 DATA = Annotated[Path, typer.Argument(metavar="DATA", help="YAML file of a data set, or a KITTI or ONCE folder.")]

@@ -57,7 +57,7 @@ def parse_calibration(text: str, where: str = "calibration") -> Calibration:
         joined = torch.cat((rotation, shift), dim=1).flatten().tolist()
         lines["Tr_velo_to_cam"] = (lines["R"][0], [repr(value) for value in joined])
     if "Tr" in lines and not any(name in lines for name in CALIBRATION_KEYS["R0_rect"][0]):
-        lines["R0_rect"] = (lines["Tr"][0], "1 0 0 0 1 0 0 0 1".split())
+        lines["R0_rect"] = (lines["Tr"][0], ["1", "0", "0", "0", "1", "0", "0", "0", "1"])
     matrices = []
     for key, (names, shape) in CALIBRATION_KEYS.items():
         found = next((name for name in names if name in lines), None)
