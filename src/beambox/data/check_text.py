@@ -107,9 +107,9 @@ def _placements(report: DataReport) -> Iterator[str]:
         )
     if report.placed < FEW_BOXES or not report.placements:
         return
-    here, points = report.placements[AS_LABELLED]
+    here = report.placements[AS_LABELLED][0]
     best = max(MISTAKES, key=lambda name: report.placements[name])
-    there, more = report.placements[best]
+    there = report.placements[best][0]
     share = here / report.placed
     if share < MANY and there > max(FEW_BOXES - 1, 1.5 * here):
         yield (
@@ -121,8 +121,6 @@ def _placements(report: DataReport) -> Iterator[str]:
             f"only {here} of {report.placed} boxes hold points above the ground: are the labels those of other frames, "
             "or in other axes or units than the points?"
         )
-    elif not report.beyond_a_turn and report.placements["with yaw in degrees"][1] > 1.2 * points:
-        yield f"boxes hold {more / max(1, points) - 1:.0%} more points with yaw in degrees; radians are expected"
 
 
 def _image_boxes(report: DataReport) -> Iterator[str]:
