@@ -15,16 +15,17 @@ from beambox.detectors.dennet import (
     KITTI_Z4,
     ONCE,
     AttentionPosition,
+    CoordinateAttention,
+    CountSet,
     DenNet,
     DenNetConfig,
+    NeighborhoodBlock,
+    Normalisation,
     dennet,
 )
 from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
-from beambox.layers.coordinate_attention import CoordinateAttention
-from beambox.layers.density import CountSet, Normalisation
-from beambox.layers.neighborhood_block import NeighborhoodBlock
 from beambox.structures import Batch
 from beambox.train.config import read_recipe
 from oracles.learning import check_found, learn_by_heart, scan_with_cars

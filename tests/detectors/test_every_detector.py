@@ -10,10 +10,10 @@ import torch
 from torch import nn
 
 from beambox.detectors.catalogue import CATALOGUE, build, config_to_dict
+from beambox.detectors.hcnet import HeightChannelFusion
 from beambox.detectors.voxel_rcnn import VoxelRcnnPredictions
 from beambox.detectors.weights import load_weights, save_weights
 from beambox.infer.fusion import fold_batch_norms
-from beambox.layers.attention import HeightChannelFusion
 from beambox.structures import Batch, Frame, Labels
 from oracles.learning import learn_by_heart
 from oracles.small_detectors import CAR, SMALL, VARIANTS, car_frame, first_stage, made, said, total

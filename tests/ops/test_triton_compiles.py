@@ -10,7 +10,7 @@ pytestmark = [
     pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="interpreted kernels cannot be compiled"),
 ]
 
-AMPERE = 80
+AMPERE, HOPPER = 80, 90
 
 
 def compile_kernel(kernel, **arguments):
@@ -22,8 +22,9 @@ def compile_kernel(kernel, **arguments):
     assert list(arguments) == kernel.arg_names, "give every argument, in order"
     types = {name: value if isinstance(value, str) else "constexpr" for name, value in arguments.items()}
     constants = {name: value for name, value in arguments.items() if not isinstance(value, str)}
-    compiled = triton.compile(ASTSource(kernel, types, constants), target=GPUTarget("cuda", AMPERE, 32))
-    assert compiled.asm["cubin"]
+    for chip in (AMPERE, HOPPER):
+        compiled = triton.compile(ASTSource(kernel, types, constants), target=GPUTarget("cuda", chip, 32))
+        assert compiled.asm["cubin"]
 
 
 def test_overlaps_compile():
@@ -75,4 +76,20 @@ def test_attention_compiles(kept, given, ones):
     compile_kernel(
         gpu._to_keys, q=given, weights=kept, slopes=kept, gradient=given, dk=given, dv=given, row_low="*i64",
         row_high="*i64", **sizes,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("values", "bias", "widths"), [("*fp32", "*fp32", (16, 64)), ("*bf16", None, (64, 64)), ("*fp16", "*fp16", (16, 16))]
+)
+def test_sparse_convolution_compiles(values, bias, widths):
+    from beambox.ops.sparse_conv import gpu
+
+    sizes = {"rows": "i32", "offsets": "i32", "c_in": "i32", "c_out": "i32"}
+    blocks = {"block": gpu.ROWS, "in_width": widths[0], "out_width": widths[1]}
+    compile_kernel(
+        gpu._multiply, features=values, weight=values, bias=bias, table="*i32", out=values, **sizes, **blocks
+    )  # fmt: skip
+    compile_kernel(
+        gpu._accumulate, features=values, grad=values, table="*i32", parts="*fp32", **sizes, stretch="i32", **blocks
     )  # fmt: skip

@@ -10,18 +10,16 @@ import torch
 from torch import Tensor
 
 from beambox.detectors.catalogue import CATALOGUE
-from beambox.detectors.dennet import AttentionPosition, DenNetConfig
-from beambox.detectors.hcnet import HCNetConfig
+from beambox.detectors.dennet import AttentionPosition, CountSet, DenNetConfig, Normalisation
+from beambox.detectors.hcnet import Gate, HCNetConfig, HeightChannelKind
 from beambox.detectors.kassd import KamOptions, KassdConfig, KassdPredictions, Neck
+from beambox.detectors.kassd.keypoints import ExtraPoint, KeypointLayout
 from beambox.detectors.pointpillars import PointPillarsConfig
 from beambox.detectors.second import KITTI_CAR, SecondConfig
 from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, VoxelRcnnPredictions
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
-from beambox.layers.attention import Gate, HeightChannelKind
-from beambox.layers.density import CountSet, Normalisation
 from beambox.layers.heads import AnchorPredictions
-from beambox.layers.keypoints import ExtraPoint, KeypointLayout
 from beambox.layers.roi import ProposalLimits, RoiSampling
 from beambox.structures import Frame, Labels
 

@@ -15,7 +15,7 @@ recalls). Weights trained on KITTI by its recipe are not available to compare wi
 Where the paper is silent or contradicts itself (``docs/kassd.md`` tells each at length):
 
 * equation 3 as printed puts keypoints beside the box (``l`` read as 1, a wrong sign, a sine for a cosine): corrected,
-  and drawn in :mod:`beambox.layers.keypoints`;
+  and drawn in :mod:`beambox.detectors.kassd.keypoints`;
 * 4, 18 and 28 border points are distinct points, ``2 (m + n) - 4``; the inner ones are the inner corners of the lattice
   and the anchor, although figure 7 draws the centre (``extra_point``);
 * equation 4's index bounds overlap: the channels are numbered around the box, corners once;
@@ -42,10 +42,12 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError
 from beambox.detectors.contract import detections_from, targets_from
+from beambox.detectors.kassd.keypoints import KeypointLayout, KeypointScores
+from beambox.detectors.kassd.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
 from beambox.detectors.second import KITTI_VOXELS, STRIDE
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, AnchorClass, AnchorGrid
-from beambox.layers.bev import BevBackbone
+from beambox.layers.bev import BevBackbone, conv_bn_relu, deconv_bn_relu
 from beambox.layers.encoders import VoxelEncoder, mean_voxels
 from beambox.layers.heads import (
     AnchorHead,
@@ -56,10 +58,7 @@ from beambox.layers.heads import (
     best_anchors,
     select_boxes,
 )
-from beambox.layers.keypoints import KeypointLayout, KeypointScores
-from beambox.layers.location_attention import LamReduce, LocationAttention
 from beambox.layers.losses import sigmoid_focal
-from beambox.layers.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
 from beambox.ops.nms import nms
 from beambox.ops.rotated_iou import iou_3d
 from beambox.ops.voxelize import Voxels, voxelize
@@ -67,7 +66,19 @@ from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["KamOptions", "KamScore", "Kassd", "KassdConfig", "KassdPredictions", "Neck", "kassd"]
+__all__ = [
+    "FeatureReuse",
+    "KamOptions",
+    "KamScore",
+    "Kassd",
+    "KassdConfig",
+    "KassdPredictions",
+    "LamReduce",
+    "LocationAttention",
+    "Neck",
+    "kassd",
+    "location_attention",
+]
 
 
 class Neck(enum.Enum):
@@ -83,6 +94,15 @@ class Neck(enum.Enum):
     """The module with dense dilated convolutions at its lowest resolution."""
     SPP = "spp"
     """The module with spatial pyramid pooling at its lowest resolution."""
+
+
+class LamReduce(enum.Enum):
+    """How a place's channels become one number."""
+
+    SUM = "sum"
+    """KASSD, equation 1."""
+    MEAN = "mean"
+    """Softer weights, whatever the number of channels."""
 
 
 class KamScore(enum.Enum):
@@ -314,6 +334,93 @@ class Kassd(nn.Module):
         boxes, score, label = boxes[good], score[good], label[good]
         keep = nms(boxes, score, post.nms_iou, post.nms_pre, post.nms_post)
         return boxes[keep], score[keep], label[keep]
+
+
+def location_attention(high: Tensor, low: Tensor, reduce: LamReduce = LamReduce.SUM) -> Tensor:
+    """Join two maps by a softmax over the pair at every place (LAM; KASSD, equations 1 and 2).
+
+    ``(p0, p1) = softmax(sum_c high, sum_c low)``, output ``p0 * high + p1 * low``. It has no parameters.
+
+    Args:
+        high: ``(B, C, Y, X)`` features of the higher level (F3).
+        low: ``(B, C, Y, X)`` features of the lower level (F4).
+        reduce: from a place's channels to one number.
+
+    Returns:
+        ``(B, C, Y, X)``.
+    """
+    difference = (high - low).sum(dim=1, keepdim=True, dtype=torch.promote_types(high.dtype, torch.float32))
+    if reduce is LamReduce.MEAN:
+        difference = difference / high.shape[1]
+    weight = torch.sigmoid(difference).to(high.dtype)  # (B, 1, Y, X), the softmax of a pair
+    return low + weight * (high - low)
+
+
+class FeatureReuse(nn.Module):
+    """The feature reuse strategy (FRS; KASSD, section 3.4 and figure 5a).
+
+    ::
+
+        F0 = reduce(bev)                 1 x 1, c channels
+        F1 = three(F0) + F0              3 convolutions 3 x 3
+        F2 = down(F1)                    stride 2, then 2 convolutions; 2 c channels at half the size
+        F3 = up_high(F2) + F1 + F0       the high level
+        F4 = up_low(F2)  + F0            the low level
+
+    Branch 2 of the figure is F0 added everywhere, branch 3 is F1 added to F3; ``reuse`` off leaves only F1 in F3.
+    ``context`` works on F2, where KASSD's table 5 inserts other modules.
+    """
+
+    def __init__(
+        self, in_channels: int, width: int = 128, reuse: bool = True, context: nn.Module | None = None
+    ) -> None:
+        super().__init__()
+        self.reuse = reuse
+        self.out_channels = width
+        self.reduce = conv_bn_relu(in_channels, width, kernel=1)
+        self.three = nn.Sequential(*(conv_bn_relu(width, width) for _ in range(3)))
+        self.down = nn.Sequential(
+            conv_bn_relu(width, 2 * width, stride=2),
+            conv_bn_relu(2 * width, 2 * width),
+            conv_bn_relu(2 * width, 2 * width),
+        )
+        self.context = nn.Identity() if context is None else context
+        self.up_high = deconv_bn_relu(2 * width, width, 3, 2, padding=1, output_padding=1)
+        self.up_low = deconv_bn_relu(2 * width, width, 3, 2, padding=1, output_padding=1)
+
+    def forward(self, bev: Tensor) -> tuple[Tensor, Tensor]:
+        """Map ``(B, in_channels, Y, X)`` to the high and the low level, ``(B, width, Y, X)`` each."""
+        height, width = bev.shape[-2:]
+        f0 = self.reduce(bev)  # (B, c, Y, X)
+        f1 = self.three(f0)  # (B, c, Y, X)
+        f1 = f1 + f0 if self.reuse else f1
+        f2 = self.context(self.down(f1))  # (B, 2 c, Y / 2, X / 2)
+        high = self.up_high(f2)[..., :height, :width] + f1  # an odd size halved and doubled is one larger
+        low = self.up_low(f2)[..., :height, :width]
+        return (high + f0, low + f0) if self.reuse else (high, low)
+
+
+class LocationAttention(nn.Module):
+    """The lightweight location attention module (LLM): FRS, then LAM; ``lam`` off adds the two levels instead."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        width: int = 128,
+        reuse: bool = True,
+        lam: bool = True,
+        reduce: LamReduce = LamReduce.SUM,
+        context: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        self.levels = FeatureReuse(in_channels, width, reuse, context)
+        self.lam, self.reduce = lam, reduce
+        self.out_channels = width
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, width, Y, X)``."""
+        high, low = self.levels(bev)
+        return location_attention(high, low, self.reduce) if self.lam else high + low
 
 
 def make_neck(config: KassdConfig, in_channels: int) -> LocationAttention | BevBackbone | PyramidAttention:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.layers.coordinate_attention import CoordinateAttention
+from beambox.detectors.dennet import CoordinateAttention
 
 
 @torch.no_grad()

@@ -7,11 +7,11 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.detectors.catalogue import build, config_to_dict
 from beambox.detectors.kassd import KamOptions, KamScore, Kassd, KassdConfig, KassdPredictions, Neck, kassd
+from beambox.detectors.kassd.keypoints import ExtraPoint, KeypointLayout
+from beambox.detectors.kassd.network import LamReduce
 from beambox.detectors.second import KITTI_CAR, second
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.heads import LossWeights
-from beambox.layers.keypoints import ExtraPoint, KeypointLayout
-from beambox.layers.location_attention import LamReduce
 from beambox.structures import Batch
 from oracles.learning import check_found, check_headings, learn_by_heart, scan_with_cars
 from oracles.small_detectors import CAR, KASSD, VARIANTS, car_frame, made

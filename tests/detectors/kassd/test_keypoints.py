@@ -5,8 +5,14 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
+from beambox.detectors.kassd.keypoints import (
+    ExtraPoint,
+    KeypointLayout,
+    KeypointScores,
+    map_coordinates,
+    sample_bilinear,
+)
 from beambox.geometry.grid import VoxelGrid
-from beambox.layers.keypoints import ExtraPoint, KeypointLayout, KeypointScores, map_coordinates, sample_bilinear
 from oracles.clouds import random_boxes
 
 KITTI = VoxelGrid((0.0, -40.0, -3.0), (70.4, 40.0, 1.0), (0.05, 0.05, 0.1))

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from beambox.checks import BeamboxError
-from beambox.geometry.grid import VoxelGrid
-from beambox.layers.attention import (
+from beambox.detectors.hcnet import (
     AdaptiveAdjustment,
     Cbam,
     Gate,
@@ -17,6 +16,7 @@ from beambox.layers.attention import (
     pillar_stacks,
     pseudo_images,
 )
+from beambox.geometry.grid import VoxelGrid
 from beambox.ops.scatter import scatter_bev
 from beambox.ops.voxelize import Voxels, voxelize
 from oracles import attention as oracle

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from beambox.layers.location_attention import FeatureReuse, LamReduce, LocationAttention, location_attention
-from beambox.layers.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
+from beambox.detectors.kassd.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
+from beambox.detectors.kassd.network import FeatureReuse, LamReduce, LocationAttention, location_attention
 
 
 def test_attention_equals_a_literal_softmax() -> None:

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beambox.checks import BeamboxError
+from beambox.detectors.dennet import CountSet, DensityBranch, Normalisation, count_points, normalised, patch_cells
 from beambox.geometry.grid import VoxelGrid
-from beambox.layers.density import CountSet, DensityBranch, Normalisation, count_points, normalised, patch_cells
 from beambox.layers.encoders import VoxelEncoder, mean_voxels
 from beambox.ops.voxelize import Voxels, voxelize
 

@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional
 
 from beambox.checks import BeamboxError
-from beambox.layers.neighborhood_block import NeighborhoodAttention, NeighborhoodBlock
+from beambox.detectors.dennet import NeighborhoodAttention, NeighborhoodBlock
 
 
 def size_of(module: torch.nn.Module) -> int:
