@@ -2,8 +2,6 @@
 
 import os
 
-os.environ.setdefault("MPLBACKEND", "Agg")
-
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
