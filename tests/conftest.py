@@ -1,7 +1,5 @@
 """Settings of all tests."""
 
-import os
-
 import pytest
 import torch
 from hypothesis import HealthCheck, settings

@@ -22,6 +22,7 @@ __all__ = [
     "expect_finite",
     "expect_same_length",
     "expect_shape",
+    "how_to_install",
 ]
 
 
@@ -84,3 +85,8 @@ def did_you_mean(word: str, options: Iterable[str]) -> str:
     if near:
         return f' (did you mean "{near[0]}"?)'
     return f" (known: {', '.join(known)})" if known else ""
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra of beambox, which no index holds: from its checkout."""
+    return f'python -m pip install ".[{extra}]" in the checkout of beambox'
