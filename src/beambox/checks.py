@@ -27,6 +27,7 @@ __all__ = [
     "expect_one_of",
     "expect_same_length",
     "expect_shape",
+    "how_to_install",
     "printable",
 ]
 
@@ -161,3 +162,8 @@ def printable(text: str, limit: int | None = None) -> str:
         letter if letter.isprintable() or letter in "\n\t" else letter.encode("unicode_escape").decode()
         for letter in text
     )
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra of beambox, which no index holds: from its checkout."""
+    return f'python -m pip install ".[{extra}]" in the checkout of beambox'

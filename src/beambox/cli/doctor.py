@@ -48,10 +48,9 @@ def command(
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
     from beambox.infer.trained import Trained
-    from beambox.zoo import shipped
+    from beambox.zoo import DEFAULT, shipped
 
-    names = list(shipped())
-    name = model or (names[0] if names else "")
+    name = model or (DEFAULT if DEFAULT in shipped() else "")
     detector = load(name, device=device, view="full", fields=fields or None) if name else None
     trained = Trained(KITTI_PILLARS) if detector is None else Trained.of(detector.card, detector.grid)
     for sweep in find_sweeps(inputs):

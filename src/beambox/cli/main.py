@@ -27,6 +27,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
+    "recipes": ("beambox.cli.recipes:command", "the shipped recipes: for whom, how long, whether ever run"),
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
     "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
@@ -44,7 +45,7 @@ EXAMPLES = (
     ("beambox show scan.bin --model pointpillars-sim --out scan.png", "and look at them"),
     ("beambox doctor scan.bin", "why are there no detections?"),
     ("beambox simulate data --frames 200 --seed 1", "make a labelled data set"),
-    ("beambox train recipes/pointpillars_small.yaml --data data --out run", "train on it"),
+    ("beambox train pointpillars-small --data data --out run", "train on it"),
     ("beambox evaluate run --data data", "and score the result"),
 )
 
