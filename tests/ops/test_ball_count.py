@@ -13,7 +13,6 @@ from oracles.clouds import fan
 from oracles.paths import data_dir
 
 
-
 def by_bits(index, cell, radius):
     """The numba version for one radius, in the company of others, which share its map."""
     return cpu.ball_counts(index, cell, (0.37, radius, 2 * radius))[:, 1]

@@ -91,7 +91,8 @@ def test_attention_compiles(kept, given, ones):
 
 
 @pytest.mark.parametrize(
-    ("values", "bias", "widths"), [("*fp32", "*fp32", (16, 64)), ("*bf16", None, (64, 64)), ("*fp16", "*fp16", (16, 16))]
+    ("values", "bias", "widths"),
+    [("*fp32", "*fp32", (16, 64)), ("*bf16", None, (64, 64)), ("*fp16", "*fp16", (16, 16))],
 )
 def test_sparse_convolution_compiles(values, bias, widths):
     from beambox.ops.sparse_conv import gpu

@@ -66,7 +66,9 @@ def test_nms_equals_reference(count, threshold):
         assert edit_distance(got, plain_nms.nms(boxes, scores, threshold, *limits).tolist()) == 0
 
 
-@pytest.mark.parametrize(("places", "post", "extent"), [(1, 3, 5.0), (150, 200, 12.0), (150, 20, 3.0), (200, 90, 300.0)])
+@pytest.mark.parametrize(
+    ("places", "post", "extent"), [(1, 3, 5.0), (150, 200, 12.0), (150, 20, 3.0), (200, 90, 300.0)]
+)
 def test_nms_of_samples_equals_reference(places, post, extent):
     generator = torch.Generator().manual_seed(places)
     boxes = random_boxes(4 * places, generator, extent, torch.float32).view(4, places, 7).to(DEVICE)
