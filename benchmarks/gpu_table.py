@@ -58,7 +58,7 @@ def speed(report: Report) -> list[str]:
     ]
     for name in DETECTORS:
         told = items(report, f"latency:{name}")
-        main = "bfloat16" if f"bfloat16 batch 1" in told else "float32"
+        main = "bfloat16" if "bfloat16 batch 1" in told else "float32"
         one, eight, plain = (told.get(k, {}) for k in (f"{main} batch 1", f"{main} batch 8", "float32 batch 1"))
         work, launches, waits = (told.get(k, {}) for k in ("work, batch 1", "launches, batch 1", "waits, batch 1"))
         ms = one.get("ms")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, linear_keys
 
-__all__ = ["convolve", "find_targets", "neighbour_table"]
+__all__ = ["convolve", "find_targets", "input_rows", "neighbour_table"]
 
 
 def find_targets(source: Sites, geometry: Geometry) -> Tensor:
@@ -49,6 +49,22 @@ def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
     return table
 
 
+def input_rows(pairs: KernelMap) -> Tensor:
+    """Build ``(V_out, K)`` int32 from a map: the row of the input site that reaches an output through an offset, or -1.
+
+    To be kept with the map: ``pairs.kept(input_rows)``.
+    """
+    if pairs.mirror is None:
+        return neighbour_table(pairs.source, pairs.target, pairs.geometry)
+    forward = pairs.mirror.kept(input_rows)
+    if pairs.geometry.submanifold:
+        return forward.flip(1).contiguous()  # a centred kernel mirrors itself
+    back = torch.full((len(pairs.target), forward.shape[1]), -1, dtype=torch.int32, device=forward.device)
+    out_row, offset = torch.nonzero(forward >= 0, as_tuple=True)  # each (input, offset) pair occurs once
+    back[forward[out_row, offset].long(), offset] = out_row.int()
+    return back
+
+
 def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Gather, multiply and add up, one kernel offset after the other.
 
@@ -61,7 +77,7 @@ def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
     Returns:
         ``(V_out, C_out)`` in the type of ``features``; half precision is added up in float32.
     """
-    table = pairs.table
+    table = pairs.kept(input_rows)
     wide = torch.promote_types(features.dtype, torch.float32)
     out = features.new_zeros((len(table), weight.shape[2]), dtype=wide)
     for k in range(table.shape[1]):

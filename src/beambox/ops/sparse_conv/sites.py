@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
 
-if TYPE_CHECKING:
-    from beambox.ops.sparse_conv.cpu_maps import BlockPairs
-
 __all__ = ["Geometry", "KernelMap", "Sites", "Triple"]
 
 Triple = tuple[int, int, int]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,11 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class KernelMap:
-    """Which input site feeds which output site through which kernel offset; found when first asked for."""
+    """Which input site feeds which output site through which kernel offset.
+
+    A record of the two sets of sites and the geometry between them. Each backend builds the pairs in the form that
+    suits it when it first needs them, and keeps them here.
+    """
 
     source: Sites
     """The ``V_in`` input sites."""
@@ -93,33 +96,19 @@ class KernelMap:
     """Of the convolution, or of the one that this map inverts."""
     mirror: KernelMap | None = None
     """The map of which this one is the inverse, if it is one."""
+    built: dict[Callable[[KernelMap], Any], Any] = field(default_factory=dict, repr=False)
+    """What backends have built from it."""
 
     @cached_property
     def inverse(self) -> KernelMap:
         """The same pairs read from output to input: the map of the transposed convolution and of gradients."""
         return self.mirror or KernelMap(self.target, self.source, self.geometry, self)
 
-    @cached_property
-    def table(self) -> Tensor:
-        """``(V_out, K)`` int32 row of the input site that reaches an output through an offset, or -1."""
-        if self.mirror is None:
-            from beambox.ops.sparse_conv.reference import neighbour_table
-
-            return neighbour_table(self.source, self.target, self.geometry)
-        forward = self.mirror.table
-        if self.geometry.submanifold:
-            return forward.flip(1).contiguous()  # a centred kernel mirrors itself
-        back = torch.full((len(self.target), forward.shape[1]), -1, dtype=torch.int32, device=forward.device)
-        out_row, offset = torch.nonzero(forward >= 0, as_tuple=True)  # each (input, offset) pair occurs once
-        back[forward[out_row, offset].long(), offset] = out_row.int()
-        return back
-
-    @cached_property
-    def blocks(self) -> BlockPairs:
-        """The same pairs grouped as the CPU works on them."""
-        from beambox.ops.sparse_conv.cpu_maps import find_pairs
-
-        return find_pairs(self.source, self.target, self.geometry, self.mirror is not None)
+    def kept(self, build: Callable[[KernelMap], T]) -> T:
+        """Return what a backend builds from this map, such as a table of rows; built once and kept with the map."""
+        if build not in self.built:
+            self.built[build] = build(self)
+        return self.built[build]
 
 
 @dataclass(frozen=True, eq=False)
