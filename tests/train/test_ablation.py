@@ -337,3 +337,17 @@ def test_a_missing_recipe_or_folder_is_said(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.chdir(ROOT)
     error = run_command("hcnet-table3", "--data", str(tmp_path / "none")).exception
     assert str(error) == f"--data: there is no folder {tmp_path / 'none'}"
+
+
+def test_the_papers_tables_hold_what_they_print() -> None:
+    def row(table: str, name: str) -> tuple[float | None, ...]:
+        return next(row.published for row in table_of(table).rows if row.name == name)
+
+    assert row("dennet-table1", "DenNet") == (90.72, 81.93, 77.48, 46.10, 40.23, 33.47, 78.89, 64.15, 56.81)
+    assert row("dennet-table2", "Voxel R-CNN") == (92.86, 85.13, 82.84, 69.37, 61.56, 56.39, 91.63, 74.52, 70.25)
+    assert row("dennet-table2", "PV-RCNN") == row("dennet-table1", "PV-RCNN"), "as printed, and remarked upon"
+    assert row("kassd-table1", "KASSD") == (88.92, 79.75, 72.17) and len(table_of("kassd-table1").rows) == 18
+    assert row("kassd-table2", "CIA-SSD") == (90.04, 79.81, 78.80) and len(table_of("kassd-table2").rows) == 22
+    assert [r.published for r in table_of("kassd-table7").rows] == [(643.0,), (60.0,), (46.3,), (38.0,), (45.9,)]
+    assert row("hcnet-table1", "PointPillars") == (87.50, 77.01, 74.77, 16.0)
+    assert row("hcnet-table2", "HCNet")[-1] == 32.0
