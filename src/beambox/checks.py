@@ -27,7 +27,13 @@ __all__ = [
     "expect_one_of",
     "expect_same_length",
     "expect_shape",
+    "how_to_install",
+    "printable",
 ]
+
+
+LONGEST_WORD = 200
+"""No name is looked up by likeness that has more letters: it is no typing error, and comparing takes long."""
 
 
 class BeamboxError(ValueError):
@@ -131,7 +137,33 @@ def choose_fields(settings: Any) -> None:
 def did_you_mean(word: str, options: Iterable[str]) -> str:
     """Return `` (did you mean "x"?)`` for the nearest option, or the list of options where none is near."""
     known = sorted(options)
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    near = [] if len(word) > LONGEST_WORD else difflib.get_close_matches(word, known[:1000], n=1, cutoff=0.6)
     if near:
         return f' (did you mean "{near[0]}"?)'
-    return f" (known: {', '.join(known)})" if known else ""
+    more = f" and {len(known) - 40} more" if len(known) > 40 else ""
+    return f" (known: {', '.join(known[:40])}{more})" if known else ""
+
+
+def printable(text: str, limit: int | None = None) -> str:
+    r"""Return text that a terminal and a picture can show: what would steer a terminal is written as an escape.
+
+    Names and messages come from files, and ``\x1b[2J`` in one of them would otherwise clear the screen.
+
+    Args:
+        text: anything.
+        limit: longest result in characters; the middle of longer texts is left out, and their length said.
+    """
+    if limit is not None and len(text) > limit:
+        half = max(1, limit // 2 - 20)
+        text = f"{text[:half]} ... ({len(text):,} characters) ... {text[-half:]}"
+    if text.replace("\n", "").replace("\t", "").isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() or letter in "\n\t" else letter.encode("unicode_escape").decode()
+        for letter in text
+    )
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra of beambox, which no index holds: from its checkout."""
+    return f'python -m pip install ".[{extra}]" in the checkout of beambox'

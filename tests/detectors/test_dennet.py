@@ -29,7 +29,6 @@ from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.structures import Batch
 from beambox.train.config import read_recipe
 from oracles.learning import check_found, learn_by_heart, scan_with_cars
-from oracles.paths import ROOT
 from oracles.scenes import scene
 from oracles.small_detectors import CAR, DENNET, TWO_STAGES, car_frame, made
 
@@ -105,15 +104,15 @@ def test_the_defaults_are_the_papers_setting() -> None:
 @pytest.mark.parametrize(
     ("name", "config"),
     [
-        ("dennet_kitti", FULL),
-        ("dennet_kitti_z4", KITTI_Z4),
-        ("dennet_kitti_005", KITTI_005),
-        ("dennet_once", ONCE),
-        ("voxelrcnn_once", voxel_rcnn_module.ONCE),
+        (("dennet-kitti-3class",), FULL),
+        (("dennet-kitti-3class", "detector.options.grid.maximum=[70.4, 40.0, 1.0]"), KITTI_Z4),
+        (("dennet-kitti-3class-005",), KITTI_005),
+        (("dennet-once",), ONCE),
+        (("voxel_rcnn-once",), voxel_rcnn_module.ONCE),
     ],
 )
-def test_recipes_hold_the_named_settings(name: str, config: VoxelRcnnConfig) -> None:
-    recipe = read_recipe(ROOT / "recipes" / f"{name}.yaml")
+def test_recipes_hold_the_named_settings(name: tuple[str, ...], config: VoxelRcnnConfig) -> None:
+    recipe = read_recipe(name[0], name[1:])
     assert config_from_dict(type(config), recipe.detector.options) == config
     assert (recipe.optim.lr, recipe.optim.epochs, recipe.optim.batch) == (0.003, 100, 8)
 

@@ -69,7 +69,7 @@ from beambox.layers.heads import PostProcess
 from beambox.layers.roi import ProposalLimits
 from beambox.layers.roi_pool import PoolLevel
 from beambox.layers.sparse import levels_left, sparse_block
-from beambox.ops.ball_count import ball_count
+from beambox.ops.ball_count import ball_counts
 from beambox.ops.ball_count.reference import TOLERANCE
 from beambox.ops.neighborhood import neighborhood_attention
 from beambox.ops.sparse_conv import Sites, SparseTensor, linear_keys
@@ -367,7 +367,8 @@ class DensityBranch(nn.Module):
     def features(self, sites: Sites, voxels: Voxels) -> Tensor:
         """Return each voxel's densities ``(V, radii)``, and with ``own_points`` its own, in the order of ``sites``."""
         cell = voxels.grid.cell
-        columns = [normalised(self.counts(sites, voxels, r), r, cell, self.normalisation) for r in self.radii]
+        counts = self.counts(sites, voxels).unbind(dim=1)
+        columns = [normalised(count, r, cell, self.normalisation) for count, r in zip(counts, self.radii)]
         if self.own_points is not None:
             row = torch.searchsorted(sites.sorted_keys, linear_keys(voxels.index, sites.shape))
             own = torch.empty(len(sites), device=voxels.count.device)
@@ -376,14 +377,16 @@ class DensityBranch(nn.Module):
         return torch.stack(columns, dim=1)
 
     @torch.no_grad()
-    def counts(self, sites: Sites, voxels: Voxels, radius: float) -> Tensor:
-        """Return how many voxels or points lie within a radius of each voxel's centre, ``(V,)`` int64."""
+    def counts(self, sites: Sites, voxels: Voxels) -> Tensor:
+        """Return how many voxels or points lie within each radius of each voxel's centre, ``(V, R)`` int64."""
         if self.count_set is CountSet.VOXELS:
-            count = ball_count(sites.indices, voxels.grid.cell, radius)
+            extent = (sites.batch_size, *sites.shape)
+            count = ball_counts(sites.indices, voxels.grid.cell, self.radii, extent)
         else:
             centres = voxels.grid.centre(sites.indices[:, 1:])
-            of_point = voxels.index[voxels.voxel, 0]
-            count = count_points(centres, sites.indices[:, 0], voxels.points[:, :3], of_point, radius)
+            points, of_point, sample = voxels.points[:, :3], voxels.index[voxels.voxel, 0], sites.indices[:, 0]
+            count = [count_points(centres, sample, points, of_point, radius) for radius in self.radii]
+            count = torch.stack(count, dim=1)
         return count if self.max_count is None else count.clamp(max=self.max_count)
 
 

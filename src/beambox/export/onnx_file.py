@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from beambox import __version__
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 from beambox.detectors.catalogue import config_to_dict, name_of
 from beambox.detectors.hcnet import HCNet
 from beambox.detectors.pointpillars import PointPillars
@@ -35,7 +35,7 @@ __all__ = ["OPSETS", "DenseGraph", "Written", "export_onnx"]
 OPSETS = range(18, 24)
 """Versions of ONNX's operators that can be asked for; before 18 there is no maximum over groups."""
 FORMAT = "beambox-onnx-1"
-INSTALL = "pip install 'beambox[export]'"
+INSTALL = how_to_install("export")
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class Table:
     protocol: str
     """What the paper's numbers were measured on."""
     recipe: str
-    """Recipe of every row, a file of ``recipes/`` without its ending."""
+    """Name of the shipped recipe of every row."""
     columns: tuple[Column, ...]
     """What is measured."""
     rows: tuple[Row, ...]

@@ -13,7 +13,7 @@ DENNET: dict[str, Table] = {
     "dennet-table1": Table(
         title="DenNet, table 1: 3-D detection, three classes",
         protocol="KITTI test server, R40; IoU 0.7 printed for all; the server takes 0.5 for pedestrian and cyclist",
-        recipe="dennet_kitti",
+        recipe="dennet-kitti-3class",
         columns=THREE_CLASSES,
         rows=(
             Row("SECOND", (84.65, 75.96, 68.71, 45.31, 35.52, 33.14, 75.83, 60.82, 53.67)),
@@ -34,7 +34,7 @@ DENNET: dict[str, Table] = {
     "dennet-table2": Table(
         title="DenNet, table 2: 3-D detection, three classes",
         protocol="KITTI validation split, R40, IoU 0.7, 0.5, 0.5",
-        recipe="dennet_kitti",
+        recipe="dennet-kitti-3class",
         columns=THREE_CLASSES,
         rows=(
             Row("PV-RCNN", (90.25, 81.43, 76.82, 52.17, 43.29, 40.29, 78.6, 63.71, 57.65)),
@@ -54,7 +54,7 @@ DENNET: dict[str, Table] = {
     "dennet-table4": Table(
         title="DenNet, table 4: its three modules",
         protocol="ONCE validation split, AP over all distances; device and protocol of the times are not stated",
-        recipe="dennet_once",
+        recipe="dennet-once",
         columns=(
             *(Column(f"ONCE {name}", "overall", (name, "overall")) for name in ("Vehicle", "Pedestrian", "Cyclist")),
             Column("ONCE mAP", "overall", ("mean", "overall")),

@@ -12,7 +12,7 @@ HCNET: dict[str, Table] = {
     "hcnet-table1": Table(
         title="HCNet, table 1: 3-D detection on the validation split",
         protocol=HCNET_VAL,
-        recipe="hcnet_kitti_car",
+        recipe="hcnet-kitti-car",
         columns=(*CAR_3D_R11, TIME),
         rows=(
             Row("VoxelNet", (81.97, 65.46, 62.85, 230.0)),
@@ -21,12 +21,15 @@ HCNET: dict[str, Table] = {
             Row("PointRCNN", (88.26, 77.73, 76.67, 100.0)),
             Row("HCNet", (88.45, 78.01, 76.72, 32.0), {}),
         ),
-        remarks=("figure 10 draws this table", "HCNet's time is of an RTX 2080 Ti; the GPU of the others is not stated"),
+        remarks=(
+            "figure 10 draws this table",
+            "HCNet's time is of an RTX 2080 Ti; the GPU of the others is not stated",
+        ),
     ),
     "hcnet-table2": Table(
         title="HCNet, table 2: from above, in 3-D, and orientation",
         protocol="KITTI test server, cars, IoU 0.7; HCNet's own row (late 2021) is R40, the others are older, R11",
-        recipe="hcnet_kitti_car",
+        recipe="hcnet-kitti-car",
         columns=(*levels("Car", "bev", "R40"), *levels("Car", "3d", "R40"), *levels("Car", "aos", "R40"), TIME),
         rows=(
             Row("VoxelNet", (89.35, 79.26, 77.39, 77.47, 65.11, 57.73, None, None, None, 230.0)),
@@ -41,7 +44,7 @@ HCNET: dict[str, Table] = {
     "hcnet-table3": Table(
         title="HCNet, table 3: which attention weighs the pseudo images",
         protocol=HCNET_VAL,
-        recipe="hcnet_kitti_car",
+        recipe="hcnet-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("none", (None, None, None), {"attention": "none"}),
@@ -54,7 +57,7 @@ HCNET: dict[str, Table] = {
     "hcnet-table4": Table(
         title="HCNet, table 4: parts of the head",
         protocol=HCNET_VAL,
-        recipe="hcnet_kitti_car",
+        recipe="hcnet-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("neither", (None, None, None), {"oifm": False, "aam": False}),

@@ -22,7 +22,7 @@ KASSD: dict[str, Table] = {
     "kassd-table1": Table(
         title="KASSD, table 1: 3-D detection",
         protocol="KITTI test server, cars, IoU 0.7; recalls not stated (the server has had R40 since October 2019)",
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=levels("Car", "3d", "R40"),
         rows=(
             Row("MV3D", (74.97, 63.63, 54.0)),
@@ -49,7 +49,7 @@ KASSD: dict[str, Table] = {
     "kassd-table2": Table(
         title="KASSD, table 2: 3-D detection",
         protocol=KASSD_VAL,
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("MV3D", (86.55, 78.1, 76.67)),
@@ -80,7 +80,7 @@ KASSD: dict[str, Table] = {
     "kassd-table3": Table(
         title="KASSD, table 3: a campus seen by a 32-beam LiDAR",
         protocol="the paper's own 500 frames (WHUT), cars, IoU 0.7, R11, no difficulty levels; never published",
-        recipe="kassd_whut",
+        recipe="kassd-whut",
         columns=(Column("Car 3-D R11", "all objects", ("Car", "3d", "R11", 0)),),
         rows=(
             Row("SECOND", (72.31,), {"llm": False, "kam": False, "swapped": True}),
@@ -94,7 +94,7 @@ KASSD: dict[str, Table] = {
     "kassd-table4": Table(
         title="KASSD, table 4: its two modules",
         protocol=KASSD_VAL,
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("neither", (89.09, 78.95, 77.67), KASSD_BASELINE),
@@ -107,7 +107,7 @@ KASSD: dict[str, Table] = {
     "kassd-table5": Table(
         title="KASSD, table 5: other modules in place of LLM",
         protocol=KASSD_VAL,
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("PSA", (90.14, 79.61, 78.35), {"neck": "psa"}),
@@ -120,7 +120,7 @@ KASSD: dict[str, Table] = {
     "kassd-table6": Table(
         title="KASSD, table 6: keypoints on the border and inside",
         protocol=KASSD_VAL,
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("0 and 0", (89.09, 78.95, 77.67), KASSD_BASELINE),
@@ -136,7 +136,7 @@ KASSD: dict[str, Table] = {
     "kassd-table7": Table(
         title="KASSD, table 7: time of one sweep",
         protocol="section 4.6: mean of ten runs, with reading; its GPU and those of the others are not stated",
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=(TIME,),
         rows=(
             Row("Point-GNN", (643.0,)),
@@ -153,7 +153,7 @@ KASSD: dict[str, Table] = {
     "kassd-weights": Table(
         title="KASSD, weights of the losses: as printed, and as every relative has them",
         protocol=KASSD_VAL,
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("class 2, box 1", (90.14, 80.06, 78.91), {}),

@@ -77,7 +77,7 @@ def segment_sum(values: Tensor, segment: Tensor, size: int) -> Tensor:
         ``(S, C)``; zero where a segment has no row.
 
     Raises:
-        BeamboxError: if a shape or type does not fit, or a segment is out of range.
+        BeamboxError: if a shape or type does not fit, or, on the CPU, a segment is out of range.
     """
     _check(values, segment, size)
     return choose("segment_sum", SUM_BACKENDS, values, segment)(values, segment, size)
@@ -112,13 +112,13 @@ def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[in
         ``(B, C, ny, nx)``, zero where no voxel is; laid out channels last, as convolutions like it.
 
     Raises:
-        BeamboxError: if a shape or type does not fit, or an index leaves the map.
+        BeamboxError: if a shape or type does not fit, or, on the CPU, an index leaves the map.
     """
     expect_shape("features", features, (None, None))
     expect_shape("index", index, (len(features), 4))
     expect_dtype("index", index, torch.int64)
     ny, nx = size
-    if not exporting() and len(index):
+    if not exporting() and index.device.type == "cpu" and len(index):  # a GPU would have to be waited for
         low, high = index.amin(0).tolist(), index.amax(0).tolist()
         if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
             raise BeamboxError(
@@ -135,7 +135,7 @@ def _check(values: Tensor, segment: Tensor, size: int) -> None:
     expect_shape("segment", segment, (None,))
     expect_dtype("segment", segment, torch.int64)
     expect_same_length(values=len(values), segment=len(segment))
-    if not exporting() and len(segment):
+    if not exporting() and segment.device.type == "cpu" and len(segment):  # a GPU would have to be waited for
         low, high = (int(value) for value in segment.aminmax())
         if low < 0 or high >= size:
             raise BeamboxError(f"`segment` must lie in 0 .. {size - 1} (size {size}), got {low} .. {high}")

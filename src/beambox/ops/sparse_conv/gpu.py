@@ -15,7 +15,7 @@ import triton.language as tl
 from torch import Tensor
 
 from beambox.ops.sparse_conv.autograd import convolve_with
-from beambox.ops.sparse_conv.reference import input_rows
+from beambox.ops.sparse_conv.pairs import input_rows
 from beambox.ops.sparse_conv.sites import KernelMap
 
 __all__ = ["accumulate", "convolve", "multiply"]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
+from beambox.ops.dispatch import Backend, always, can_run_triton, choose
 
 __all__ = ["Geometry", "KernelMap", "Sites", "Triple"]
 
@@ -80,6 +81,24 @@ class Geometry:
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
 
 
+def _triton_indices() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.gpu_indices import indices_of
+
+    return indices_of
+
+
+def indices_of(keys: Tensor, order: Tensor, shape: Triple) -> Tensor:
+    """Return ``(V, 4)`` int64 (b, z, y, x) of each row from ``(V,)`` ascending keys and the row of each."""
+    nz, ny, nx = shape
+    rest, x = keys // nx, keys % nx
+    rest, y = rest // ny, rest % ny
+    ascending = torch.stack((rest // nz, rest % nz, y, x), dim=1)
+    return torch.empty_like(ascending).index_copy_(0, order, ascending)
+
+
+INDEX_BACKENDS = (Backend("triton", can_run_triton, _triton_indices), Backend("reference", always, lambda: indices_of))
+
+
 @dataclass(frozen=True, eq=False)
 class KernelMap:
     """Which input site feeds which output site through which kernel offset.
@@ -132,11 +151,7 @@ class Sites:
     @cached_property
     def indices(self) -> Tensor:
         """``(V, 4)`` int64 (b, z, y, x) of each row."""
-        _, ny, nx = self.shape
-        rest, x = self.sorted_keys // nx, self.sorted_keys % nx
-        rest, y = rest // ny, rest % ny
-        ascending = torch.stack((rest // self.shape[0], rest % self.shape[0], y, x), dim=1)
-        return torch.empty_like(ascending).index_copy_(0, self.order, ascending)
+        return choose("site_indices", INDEX_BACKENDS, self.sorted_keys)(self.sorted_keys, self.order, self.shape)
 
     def __len__(self) -> int:
         return len(self.sorted_keys)
@@ -171,6 +186,12 @@ class Sites:
                 f"`indices` must name each site once, got {len(twice)} repeated, first (b, z, y, x) = {row}; "
                 "merge the points of a cell before (voxelize does)"
             )
+        return cls(sorted_keys, order, shape, batch_size)
+
+    @classmethod
+    def trusted(cls, indices: Tensor, shape: Triple, batch_size: int) -> Sites:
+        """Return sites from int64 indices (b, z, y, x) that are known to lie inside, none twice: nothing is read."""
+        sorted_keys, order = torch.sort(linear_keys(indices, shape))
         return cls(sorted_keys, order, shape, batch_size)
 
     @classmethod
