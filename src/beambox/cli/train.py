@@ -23,16 +23,7 @@ def command(
 
     On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox.cli.main train RECIPE --data DIR
     """
-    from beambox.train.config import read_recipe
+    from beambox.verbs import train
 
-    parsed = read_recipe(recipe, change or [])
-    if data is not None and not data.is_dir():
-        from beambox.checks import MissingFileError
-
-        raise MissingFileError(f"--data: there is no folder {data}")
-
-    from beambox.train.loop import train
-
-    outcome = train(parsed, data, out or Path("runs") / parsed.name, resume)
-    if not outcome.finished:
+    if not train(recipe, data, out, overrides=change or [], resume=resume).finished:
         raise typer.Exit(130)
