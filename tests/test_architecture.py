@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "visualise": {"structures", "geometry"},
     "infer": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "zoo"},
     "train": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "infer"},
+    "report": {"infer", "data", "metrics", "visualise", "structures", "geometry", "ops"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
     "zoo": set(),
 }

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from beambox.structures import Detections, Frame, Labels
     from beambox.train.config import Recipe
     from beambox.train.loop import Outcome
+    from beambox.train.recipes import ShippedRecipe
     from beambox.visualise.bev import ColourBy, Region
 
 __all__ = ["draw", "evaluate", "export", "open_dataset", "recipes", "simulate", "train"]
@@ -169,7 +170,7 @@ def train(
     """Train a detector by a recipe.
 
     Args:
-        recipe: YAML file, or a recipe that was read.
+        recipe: the name of a shipped recipe (:func:`recipes` lists them), a YAML file, or a recipe that was read.
         data: folder that ``{data}`` stands for in the recipe.
         out: folder of the run; ``runs/NAME`` where None. It gets ``best.safetensors``, ``final.safetensors``,
             ``last.safetensors`` (to go on from), ``log.jsonl`` and ``tensorboard/``.
@@ -183,16 +184,16 @@ def train(
         BeamboxError: if the recipe, the data or the folder cannot be used.
     """
     from beambox.checks import MissingFileError
-    from beambox.train.config import Recipe, read_recipe
-    from beambox.train.loop import train as run
+    from beambox.train.config import Recipe
+    from beambox.train.stages import read_stages, train_stages
 
     if isinstance(recipe, Recipe) and overrides:
         raise BeamboxError("`overrides` change a recipe that is read from a file; change this one itself")
-    parsed = recipe if isinstance(recipe, Recipe) else read_recipe(recipe, overrides)
+    stages = [recipe] if isinstance(recipe, Recipe) else read_stages(recipe, overrides)
     folder = None if data is None else Path(data)
     if folder is not None and not folder.is_dir():
         raise MissingFileError(f"--data: there is no folder {folder}")
-    return run(parsed, folder, Path(out) if out is not None else Path("runs") / parsed.name, resume)
+    return train_stages(stages, folder, Path(out) if out is not None else Path("runs") / stages[-1].name, resume)
 
 
 def simulate(
@@ -329,14 +330,8 @@ def export(
     return export_onnx(network, out, grid=grid, opset=opset, card=read_weights(path).card, sweeps=sweeps)
 
 
-def recipes() -> Sequence[Any]:
-    """List the shipped recipes: name, for whom, how long they take, whether they were ever run.
+def recipes() -> list[ShippedRecipe]:
+    """List the shipped recipes: name, for whom, how long they take, whether they were ever run."""
+    from beambox.train.recipes import list_recipes
 
-    Raises:
-        BeamboxError: if this installation ships none.
-    """
-    try:
-        from beambox.train.recipes import list_recipes  # pyright: ignore[reportMissingImports, reportUnknownVariableType]
-    except ImportError:
-        raise BeamboxError("this installation ships no recipes; give the YAML file of one") from None
-    return list_recipes()  # pyright: ignore[reportUnknownVariableType]
+    return list_recipes()

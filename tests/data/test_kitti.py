@@ -241,7 +241,10 @@ def test_points_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> N
     broken.points[9, 3] = float("inf")
     write_kitti_frame(tmp_path, broken)
     read = KittiSource(tmp_path, "all")[0]
-    assert len(read) == 48 and read.notes == ("dropped 2 of 50 points that are NaN or infinite",)
+    assert len(read) == 49 and read.notes == (
+        "clipped 1 of 50 intensities to [0, 1]",
+        "dropped 1 of 50 points that are NaN or infinite",
+    )
 
 
 def test_the_image_size_comes_from_the_png_header(tmp_path: Path) -> None:

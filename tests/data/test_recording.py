@@ -130,7 +130,7 @@ def test_what_cannot_be_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
         raise ImportError(name)
 
     monkeypatch.setattr(columns.importlib, "import_module", absent)
-    with pytest.raises(BeamboxError, match=r'needs the library rosbags: pip install "beambox\[recordings\]"'):
+    with pytest.raises(BeamboxError, match=r'needs the library rosbags: python -m pip install "\.\[recordings\]"'):
         sweeps_in(path)
 
 

@@ -43,15 +43,18 @@ def command(
 
         report(environment())
         return
+    from beambox.data.existence import expect_inputs
+
+    expect_inputs(inputs)
+
     from beambox.detectors.pointpillars import KITTI_PILLARS
     from beambox.infer.doctor import examine
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
     from beambox.infer.trained import Trained
-    from beambox.zoo import shipped
+    from beambox.zoo import DEFAULT, shipped
 
-    names = list(shipped())
-    name = model or (names[0] if names else "")
+    name = model or (DEFAULT if DEFAULT in shipped() else "")
     detector = load(name, device=device, view="full", fields=fields or None) if name else None
     trained = Trained(KITTI_PILLARS) if detector is None else Trained.of(detector.card, detector.grid)
     for sweep in find_sweeps(inputs):

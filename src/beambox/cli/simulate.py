@@ -33,11 +33,21 @@ def command(
         float, typer.Option(help="share of the sweeps (once: of the sequences) listed in ImageSets/val.txt")
     ] = 0.1,
     sequence_length: Annotated[int, typer.Option(help="once: sweeps in one sequence", min=1)] = 10,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder in KITTI's layout: print where the points of its objects and of ours lie in their boxes"
+        ),
+    ] = None,
 ) -> None:
     """Simulate labelled LiDAR sweeps. An interrupted or shorter data set is continued by the same command."""
+    from beambox.checks import BeamboxError
     from beambox.cli.console import announce, say
-    from beambox.verbs import simulate
+    from beambox.verbs import open_dataset, simulate
 
+    if compare and files != "kitti":
+        raise BeamboxError(f"--compare reads KITTI's layout, and --format is {files}; leave one of the two out")
+    real = open_dataset(compare, "train", camera_view=True) if compare else None  # refused before an hour of work
     told = ", ".join(f"{name} {value}" for name, value in (("sensor", sensor), ("view", view)) if value)
     announce(
         "simulate",
@@ -58,3 +68,7 @@ def command(
         sequence_length=sequence_length,
     )
     say(f"wrote {frames} frames to {out}")
+    if real is not None:
+        from beambox.simulate.compare import compare_objects
+
+        print(compare_objects(real, open_dataset(out, "train", camera_view=True)).table(), end="")

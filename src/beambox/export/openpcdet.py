@@ -114,7 +114,7 @@ def pointpillars_config(classes: int) -> PointPillarsConfig | None:
     return {
         1: replace(kitti, anchors=kitti.anchors[:1]),
         3: kitti,
-        5: replace(kitti, anchors=ONCE_ANCHORS, grid=once, max_points=20, max_pillars=60000),
+        5: replace(kitti, anchors=ONCE_ANCHORS, grid=once, max_points=20, max_voxels=60000),
     }.get(classes)
 
 

@@ -14,6 +14,7 @@ from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean, expect_same_length, expect_shape, printable
 from beambox.geometry.boxes import corners_3d
 from beambox.geometry.calibration import Calibration
+from beambox.io import name_to_word
 from beambox.structures import conversions, rows
 from beambox.structures.selecting import Index, as_numbers, positions, same
 
@@ -285,7 +286,7 @@ class Detections:
             dim=1,
         )  # (N, 13)
         lines = (
-            f"{name} -1 -1 " + " ".join(f"{value:.4f}" for value in row) + "\n"
+            f"{name_to_word(name)} -1 -1 " + " ".join(f"{value:.4f}" for value in row) + "\n"
             for name, row in zip(self.names, columns.tolist())
         )
         return "".join(lines)

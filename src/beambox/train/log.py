@@ -13,7 +13,7 @@ from typing import IO, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from beambox.checks import printable
+from beambox.checks import how_to_install, printable
 
 __all__ = ["Clock", "RunLog", "duration"]
 
@@ -83,7 +83,7 @@ class RunLog:
         try:
             from torch.utils.tensorboard.writer import SummaryWriter
         except ImportError:
-            self.say("no TensorBoard log: tensorboard is not installed (pip install 'beambox[train]')")
+            self.say(f"no TensorBoard log: tensorboard is not installed ({how_to_install('train')})")
             return None
         return SummaryWriter(str(folder), purge_step=first)
 
