@@ -102,7 +102,7 @@ class Detections:
         return len(self.scores)
 
     @overload
-    def __getitem__(self, index: Index) -> Detections: ...
+    def __getitem__(self, index: Index) -> Detections: ...  # pyright: ignore[reportOverlappingOverload]
     @overload
     def __getitem__(self, index: SupportsIndex) -> Detection: ...
     def __getitem__(self, index: SupportsIndex | Index) -> Detection | Detections:
