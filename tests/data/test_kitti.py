@@ -169,7 +169,7 @@ def test_no_text_makes_a_parser_fail_otherwise(noise: str, place: int, letters: 
 def test_results_become_detections() -> None:
     line = CAR.strip() + " 0.75\n"
     found = parse_results(line, CALIB, ("Pedestrian", "Car"), frame_id="000001")
-    assert found.names == ["Car"] and found.scores.tolist() == [0.75] and found.labels.tolist() == [1]
+    assert found.names == ["Car"] and found.scores.tolist() == [0.75] and found.class_ids.tolist() == [1]
     with pytest.raises(BeamboxError, match="expected 16 columns, got 15"):
         parse_results(CAR, CALIB)
     with pytest.raises(BeamboxError, match=r'unknown class "Car" \(did you mean "Cat"\?\)'):

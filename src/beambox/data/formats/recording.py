@@ -14,6 +14,7 @@ from typing import Any
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.formats.columns import Columns, decode, library
+from beambox.data.formats.kept import kept_open
 from beambox.data.formats.point_cloud2 import cloud_columns
 from beambox.io import check_file_name
 
@@ -49,7 +50,7 @@ def sweeps_in(path: Path) -> list[Path]:
         return [path]
 
     def read() -> list[Path]:
-        with _reader(root) as reader:
+        with kept_open(root, _reader) as reader:
             clouds = [one for one in reader.connections if one.msgtype == POINT_CLOUD]
             topics = sorted({one.topic.strip("/") for one in clouds})
             chosen = topics[0] if not topic and len(topics) == 1 else topic
@@ -92,7 +93,7 @@ def read_message(path: Path) -> Columns:
         )
 
     def read() -> Columns:
-        with _reader(root) as reader:
+        with kept_open(root, _reader) as reader:
             wanted = [one for one in reader.connections if one.topic.strip("/") == topic]
             time, number = stamp
             messages: Any = reader.messages(wanted, start=time, stop=time + 1) if wanted else ()
@@ -121,7 +122,7 @@ def _file(root: Path) -> Path:
 
 
 def _reader(root: Path) -> Any:
-    """Open a recording; older ones, without definitions of their types, hold ROS 2's own."""
+    """Make a reader of a recording; older ones, without definitions of their types, hold ROS 2's own."""
     highlevel = library("rosbags.highlevel", root, "recordings")
     typesys = library("rosbags.typesys", root, "recordings")
     return highlevel.AnyReader([root], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
