@@ -5,9 +5,8 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.detectors.catalogue import build, config_from_dict
-from beambox.detectors.hcnet import HCNET_CAR, HCNetConfig, hcnet
+from beambox.detectors.hcnet import HCNET_CAR, Gate, HCNetConfig, HeightChannelKind, hcnet, pseudo_images
 from beambox.geometry.grid import VoxelGrid
-from beambox.layers.attention import Gate, HeightChannelKind, pseudo_images
 from beambox.ops.voxelize import voxelize
 from beambox.structures import Batch
 from beambox.train.config import read_recipe

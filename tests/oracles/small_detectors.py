@@ -10,18 +10,16 @@ import torch
 from torch import Tensor
 
 from beambox.detectors.catalogue import CATALOGUE
-from beambox.detectors.dennet import AttentionPosition, DenNetConfig
-from beambox.detectors.hcnet import HCNetConfig
+from beambox.detectors.dennet import AttentionPosition, CountSet, DenNetConfig, Normalisation
+from beambox.detectors.hcnet import Gate, HCNetConfig, HeightChannelKind
 from beambox.detectors.kassd import KamOptions, KassdConfig, KassdPredictions, Neck
+from beambox.detectors.kassd.keypoints import ExtraPoint, KeypointLayout
 from beambox.detectors.pointpillars import PointPillarsConfig
 from beambox.detectors.second import KITTI_CAR, SecondConfig
 from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, VoxelRcnnPredictions
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
-from beambox.layers.attention import Gate, HeightChannelKind
-from beambox.layers.density import CountSet, Normalisation
 from beambox.layers.heads import AnchorPredictions
-from beambox.layers.keypoints import ExtraPoint, KeypointLayout
 from beambox.layers.roi import ProposalLimits, RoiSampling
 from beambox.structures import Frame, Labels
 
@@ -31,7 +29,7 @@ CAR = [6.0, 1.0, -1.0, 4.0, 1.7, 1.5, 0.4]
 POINTPILLARS = PointPillarsConfig(
     anchors=KITTI_ANCHORS[:1],
     grid=VoxelGrid((0, -10.24, -3), (20.48, 10.24, 1), (0.32, 0.32, 4)),
-    pillar_channels=8,
+    voxel_channels=8,
     depths=(1, 1, 1),
     widths=(8, 8, 16),
     up_widths=(8, 8, 8),

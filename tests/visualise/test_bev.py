@@ -109,6 +109,6 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: p
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.replace", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(BeamboxError, match=r"b\.png: No space left on device; free some space"):
         save_picture(picture, tmp_path / "new" / "b.png")
     assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["a.jpg", "a.png"]

@@ -66,7 +66,7 @@ def command(
     )
     print(report(chosen, measured, told), end="")
     if json_file is not None:
-        from beambox.train.ablation import write_json
+        from beambox.io import write_json
 
         write_json(json_file, to_json(chosen, measured, read, wanted))
 

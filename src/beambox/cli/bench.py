@@ -44,10 +44,10 @@ def command(
 
     import torch
 
-    from beambox.data.files import write_text
     from beambox.infer.benchmark import measure
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
+    from beambox.io import write_text
 
     show_log()
     if protocol not in ("stages", "kassd"):

@@ -76,7 +76,6 @@ def report(findings: Iterable[Finding]) -> None:
 
 def try_out(path: Path, detector: Detector, diagnosis: Diagnosis) -> None:
     """Detect as given and with the remedies, and tell how many detections are sure."""
-    from beambox.infer.corrections import Corrections
     from beambox.infer.doctor import Finding
 
     def sure() -> str:
@@ -85,7 +84,10 @@ def try_out(path: Path, detector: Detector, diagnosis: Diagnosis) -> None:
 
     text = f"detections with a score of at least 0.3: {sure()} as given"
     if diagnosis.options:
-        detector.corrections, detector.intensity_scale = diagnosis.corrections, diagnosis.intensity_scale
-        text += f", {sure()} with the options below"
-        detector.corrections, detector.intensity_scale = Corrections(), None
+        before = detector.corrections, detector.intensity_scale
+        try:
+            detector.corrections, detector.intensity_scale = diagnosis.corrections, diagnosis.intensity_scale
+            text += f", {sure()} with the options below"
+        finally:
+            detector.corrections, detector.intensity_scale = before
     report([Finding("trial", "note", text)])

@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from beambox.cli.options import DeviceOption, ModelArgument, PrecisionOption, RangeOption, ViewOption, parse_range
+from beambox.checks import BeamboxError
+from beambox.cli.options import (
+    ClassesOption,
+    DeviceOption,
+    IouOption,
+    ModelArgument,
+    PrecisionOption,
+    RangeOption,
+    ViewOption,
+    parse_classes,
+    parse_range,
+)
+
+if TYPE_CHECKING:
+    from beambox.data.source import FrameSource
+    from beambox.infer.predictor import Detector
+    from beambox.structures import Detections, Frame
 
 __all__ = ["command"]
 
@@ -16,13 +33,18 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     model: ModelArgument,
     data: Annotated[Path, typer.Option(help="KITTI or ONCE folder, or the YAML file of one's own data.")],
     split: Annotated[str, typer.Option(help="List of frames: the name of a file in ImageSets.")] = "val",
-    classes: Annotated[str, typer.Option(help="Classes to score, as Car,Cyclist; the model's where not given.")] = "",
-    iou: Annotated[
-        list[str] | None, typer.Option(help="Score a second time with this overlap, as Car=0.5; may be repeated.")
-    ] = None,
+    classes: ClassesOption = "",
+    iou: IouOption = None,
+    no_difficulty: Annotated[
+        bool, typer.Option("--no-difficulty", help="Every object counts, one AP a class; 3d and bev only.")
+    ] = False,
     score_threshold: Annotated[float, typer.Option(help="Drop detections with lower scores.")] = 0.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the numbers here.")] = None,
     results: Annotated[Path | None, typer.Option(help="Write KITTI result files into this folder.")] = None,
+    keep: Annotated[
+        Path | None,
+        typer.Option(help="Keep detections in this file, frame by frame; what it holds is not detected again."),
+    ] = None,
     range_: RangeOption = "",
     view: ViewOption = "auto",
     published: Annotated[
@@ -36,28 +58,28 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     """Detect in a labelled data set and score by KITTI's rules, or by ONCE's where the data have its layout.
 
     Data without a camera have no difficulty levels: every object counts, and each class has one AP. Data of one's own
-    are looked at within the range that their YAML file names.
+    are looked at within the range that their YAML file names. After the AP follow the errors of the matched boxes.
     """
-    import json
-
     from beambox.cli.console import progress
     from beambox.data.custom import CustomSource
     from beambox.data.custom_config import KITTI_GROUND
     from beambox.data.once import OnceSource
     from beambox.data.opening import open_data
-    from beambox.detectors.weights import write_atomically
-    from beambox.infer.evaluate import (
-        detect_frames,
-        parse_overlaps,
-        score_frames,
-        score_once,
-        scored_frames,
-        write_results,
-    )
+    from beambox.infer.evaluate import check_classes, evaluate_frames, scored_frames
     from beambox.infer.predictor import load
+    from beambox.io import write_json
+    from beambox.metrics.rounds import parse_rounds
 
-    overlaps = parse_overlaps(iou or [])
+    rounds = parse_rounds(iou or [])
     source = open_data(data, split)
+    by_once = isinstance(source, OnceSource)
+    if published and not by_once:
+        raise BeamboxError("--published prints the rows of a table on ONCE; these data are not of ONCE's layout")
+    if results is not None and source[0].calibration is None:
+        raise BeamboxError(
+            "--results writes KITTI result files, whose boxes live in a camera's frame, and the data have no "
+            "calibration; keep the detections with --keep FILE"
+        )
     region, height = parse_range(range_), None
     if isinstance(source, CustomSource):
         region = region or source.config.range
@@ -70,20 +92,52 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         range=region,
         sensor_height=height,
     )
-    found = detect_frames(detector.detect, source, batch=batch, score_threshold=score_threshold)
-    frames = scored_frames(progress(found, len(source), "detecting"))
-    if results is not None:
-        write_results(results, frames)
-    wanted = classes.split(",") if classes else list(detector.classes)
-    tables = []
-    for thresholds in [None, overlaps] if overlaps else [None]:
-        if isinstance(source, OnceSource):
-            scored = score_once(frames, thresholds)
-            print(scored.table(Path(model).stem, published))
-        else:
-            scored = score_frames(frames, wanted, thresholds)
-            print(scored.table())
-        tables.append(scored.to_json())
-    numbers = {"default": tables[0], "given": tables[1]} if overlaps else tables[0]
+    wanted = parse_classes(classes) or list(detector.classes)
+    check_classes(wanted, rounds, by_once)
+    found = _found(detector, model, source, data, keep, batch, score_threshold)
+    frames = scored_frames(progress(_written(found, results), len(source), "detecting"))
+    scored = evaluate_frames(
+        frames,
+        wanted,
+        rounds,
+        by_once=by_once,
+        levels=not no_difficulty,
+        precision=str(detector.dtype).removeprefix("torch."),
+    )
+    print(scored.table(Path(model).stem, published))
     if json_file is not None:
-        write_atomically(json_file, (json.dumps(numbers, indent=2) + "\n").encode())
+        write_json(json_file, scored.to_json(), indent=2)
+
+
+def _found(
+    detector: Detector, model: str, source: FrameSource, data: Path, keep: Path | None, batch: int, threshold: float
+) -> Iterator[tuple[Frame, Detections]]:
+    """Detect, or take what was kept."""
+    from beambox.infer.evaluate import detect_frames
+    from beambox.infer.kept import KeptDetections, digest
+    from beambox.infer.predictor import find_weights
+
+    if keep is None:
+        return detect_frames(detector.detect, source, batch=batch, score_threshold=threshold)
+    made_by: dict[str, Any] = {
+        "model": Path(model).name,
+        "weights": digest(find_weights(model)),
+        "data": str(data.resolve()),
+        "precision": str(detector.dtype).removeprefix("torch."),
+        "range": [list(detector.grid.minimum), list(detector.grid.maximum)],
+        "view": detector.view,
+        "raised": detector.corrections.raise_by,
+        "score_threshold": threshold,
+    }
+    kept = KeptDetections(keep, made_by, detector.classes)
+    return kept.detect(detector.detect, source, batch=batch, score_threshold=threshold)
+
+
+def _written(found: Iterator[tuple[Frame, Detections]], folder: Path | None) -> Iterator[tuple[Frame, Detections]]:
+    """Write each frame's KITTI result file as soon as it is there."""
+    from beambox.infer.evaluate import write_result
+
+    for frame, detections in found:
+        if folder is not None:
+            write_result(folder, frame, detections)
+        yield frame, detections

@@ -30,6 +30,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "recipes": ("beambox.cli.recipes:command", "the shipped recipes: for whom, how long, whether ever run"),
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
+    "report": (
+        "beambox.cli.report:command",
+        "one page per evaluation: curves, errors, groups, worst failures as pictures",
+    ),
     "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
     "data": ("beambox.cli.data:app", "check a data set of one's own before training, and propose anchors for it"),
     "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),
@@ -101,8 +105,9 @@ def explain(error: OSError) -> str:
 
 def stop(message: str, status: int) -> NoReturn:
     """Print one line on stderr and leave."""
-    line = " ".join(message.split())
-    print(f"beambox: {line}", file=sys.stderr)
+    from beambox.cli.console import say
+
+    say("beambox: " + " ".join(message.split()))
     raise SystemExit(status)
 
 
@@ -146,7 +151,10 @@ def run(name: str, arguments: Sequence[str]) -> None:
         app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         settings = {"help_option_names": ["-h", "--help"]}
         app.command(name, help=help_of(command), context_settings=settings)(guard(command))
-    app(args=list(arguments), prog_name=f"beambox {name}")
+    from beambox.cli.console import plain_output
+
+    with plain_output():
+        app(args=list(arguments), prog_name=f"beambox {name}")
 
 
 def help_of(function: Callable[..., None]) -> str:

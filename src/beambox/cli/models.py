@@ -25,9 +25,9 @@ def command(
     """
     import json
 
-    from beambox.data.files import write_text
     from beambox.infer.cards import card_text, read_card
     from beambox.infer.predictor import find_weights
+    from beambox.io import write_text
     from beambox.zoo import shipped
 
     if name:

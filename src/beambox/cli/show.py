@@ -58,10 +58,10 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     Labels and camera image are found beside a sweep in KITTI's layout (../label_2, ../image_2). A page (.html) shows
     points and boxes in three dimensions in any browser, and needs no other file.
     """
-    from beambox.data.files import write_text
     from beambox.geometry.axes import Axes
     from beambox.infer.inputs import find_sweeps, read_sweep
     from beambox.infer.predictor import load
+    from beambox.io import write_text
     from beambox.visualise.canvas import save_picture
     from beambox.visualise.viewer import viewer_html
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from beambox.checks import BeamboxError, did_you_mean, expect_same_length
-from beambox.data.files import replacing
 from beambox.data.footprints import overlap_bev
 from beambox.data.formats.columns import decode
 from beambox.data.source import FrameSource
 from beambox.data.walk import walk
+from beambox.io import replacing
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 
 __all__ = ["ObjectDatabase"]

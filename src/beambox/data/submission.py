@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
-from beambox.data.files import read_text, replacing
 from beambox.data.kitti_text import RESULT_COLUMNS
+from beambox.io import read_text, replacing
 
 __all__ = ["KITTI_TEST_FRAMES", "KITTI_TYPES", "check_results", "write_submission"]
 

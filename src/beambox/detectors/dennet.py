@@ -36,13 +36,16 @@ Where the paper is silent or contradicts itself (``docs/dennet.md`` tells each a
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.nn import functional
 
-from beambox.checks import BeamboxError, expect_same_length
+from beambox.checks import BeamboxError, choose_fields, chosen, expect_same_length, expect_shape
 from beambox.detectors.second import KITTI_VOXELS, ONCE_VOXELS
 from beambox.detectors.voxel_rcnn import (
     COARSE_POOLING,
@@ -53,15 +56,26 @@ from beambox.detectors.voxel_rcnn import (
 )
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass
-from beambox.layers.bev import BevBackbone
-from beambox.layers.coordinate_attention import CoordinateAttention
-from beambox.layers.density import CountSet, DensityBranch, Normalisation
+from beambox.layers.bev import (
+    BN_EPS,
+    BN_MOMENTUM,
+    conv_bn_relu,
+    deconv_bn_relu,
+    expect_levels_meet,
+    join_levels,
+)
 from beambox.layers.encoders import mean_voxels
 from beambox.layers.heads import PostProcess
-from beambox.layers.neighborhood_block import NeighborhoodBlock
 from beambox.layers.roi import ProposalLimits
 from beambox.layers.roi_pool import PoolLevel
+from beambox.layers.sparse import levels_left, sparse_block
+from beambox.ops.ball_count import ball_counts
+from beambox.ops.ball_count.reference import TOLERANCE
+from beambox.ops.neighborhood import neighborhood_attention
+from beambox.ops.sparse_conv import Sites, SparseTensor, linear_keys
+from beambox.ops.voxelize import Voxels
 from beambox.structures.batch import Batch
+from beambox.structures.labels import Labels
 
 __all__ = [
     "DENNET_VOXELS",
@@ -70,13 +84,45 @@ __all__ = [
     "ONCE",
     "AttentionPosition",
     "AttentiveBackbone",
+    "CoordinateAttention",
+    "CountSet",
     "DenNet",
     "DenNetConfig",
+    "DensityBranch",
+    "NeighborhoodAttention",
+    "NeighborhoodBlock",
+    "Normalisation",
+    "count_points",
     "dennet",
+    "normalised",
+    "patch_cells",
 ]
 
 DENNET_VOXELS = VoxelGrid((0.0, -40.0, -3.0), (70.4, 40.0, 3.0), (0.1, 0.1, 0.15))
 """704 x 800 x 40 voxels in front of the sensor (DenNet, section 4.1; range see the module)."""
+VOXELS_AT_ONCE = 256  # bounds the memory of the distances to points
+
+
+class CountSet(str, Enum):
+    """What is counted around a voxel's centre."""
+
+    VOXELS = "voxels"
+    """Centres of the voxels that hold a point."""
+    POINTS = "points"
+    """Points kept in voxels."""
+
+
+class Normalisation(str, Enum):
+    """What a count n becomes; N is the number of voxels in a flat, fully occupied disc of the same radius."""
+
+    LOG_SHARE = "log-share"
+    """ln(1 + n) / ln(1 + N): of order 1, and not long-tailed."""
+    LOG = "log"
+    """ln(1 + n)."""
+    SHARE = "share"
+    """n / N."""
+    RAW = "raw"
+    """n."""
 
 
 class AttentionPosition(str, Enum):
@@ -132,6 +178,7 @@ class DenNetConfig(VoxelRcnnConfig):
     """Channels over hidden channels, of which there are at least 8 (Hou et al. 2021)."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         super().__post_init__()
         expect_same_length(widths=len(self.widths), na_heads=len(self.na_heads))
         if self.na_window < 1 or self.na_window % 2 == 0:
@@ -177,8 +224,13 @@ class DenNet(TwoStage):
             channels += self.density.bev_channels(levels)
         self.backbone = AttentiveBackbone(channels, config)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> VoxelRcnnPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        With ``labels`` the second stage looks at regions drawn to learn from, without at the best proposals.
+        """
         grid = self.config.grid if grid is None else grid
         points = self.voxels(batch, grid)
         voxels = mean_voxels(points, self.config.absolute_xy)  # (V, columns)
@@ -187,38 +239,297 @@ class DenNet(TwoStage):
         if self.density is not None:
             maps = torch.cat((maps, self.density(voxels.sites, points)), dim=1)  # (B, 256 + 80, ny / 8, nx / 8)
         bev = self.backbone(maps)  # (B, 256, ny / 8, nx / 8)
-        return self.detect(stages, bev, grid)
+        first = self.head(bev, grid)
+        rois, targets = self.regions(first, labels)  # R boxes
+        pooled = self.roi_pool(rois, self.levels(stages), grid)  # (R, 6 * 6 * 6 * 96)
+        refined = self.roi_head(pooled)
+        return VoxelRcnnPredictions(first, rois, refined, targets)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
         """Layers that work on whole maps; neighbourhood attention has kernels of its own, which nothing can compile."""
-        layers = [layer for stage in self.backbone.stages for layer in stage.children()]
-        return (*(layer for layer in layers if not isinstance(layer, NeighborhoodBlock)), *self.backbone.ups)
+        stages = [stage for stage in self.backbone.stages if isinstance(stage, AttentiveStage)]
+        layers = [layer for stage in stages for layer in (*stage.convolutions, *stage.further)]
+        attentions = [stage.ca for stage in stages if isinstance(stage.ca, CoordinateAttention)]
+        return (*layers, *attentions, *self.backbone.ups)
 
 
-class AttentiveBackbone(BevBackbone):
-    """Voxel R-CNN's 2-D network with both attentions in every stage (DenNet, section 3.3.2, figure 6).
+def patch_cells(radius: float, cell: Sequence[float]) -> float:
+    """Return N, the area of a disc over that of a voxel seen from above."""
+    return math.pi * radius * radius / (cell[0] * cell[1])
 
-    ==========  ==================================================================================
-    stage       layers
-    ==========  ==================================================================================
-    1           6 convolutions 3 x 3 of 64 channels, NA of 64, CA of 64
-    2           6 convolutions 3 x 3 of 128 channels, the first of stride 2, NA of 128, CA of 128
-    3           both enlarged to 128 channels at the size of the first, joined
-    ==========  ==================================================================================
+
+def normalised(count: Tensor, radius: float, cell: Sequence[float], how: Normalisation | str) -> Tensor:
+    """Turn counts ``(V,)`` within a radius into float32 features ``(V,)``."""
+    how = chosen("how", how, Normalisation)
+    count, full = count.float(), patch_cells(radius, cell)
+    if how is Normalisation.LOG_SHARE:
+        return torch.log1p(count) / math.log1p(full)
+    if how is Normalisation.LOG:
+        return torch.log1p(count)
+    return count / full if how is Normalisation.SHARE else count
+
+
+def count_points(centres: Tensor, of_centre: Tensor, points: Tensor, of_point: Tensor, radius: float) -> Tensor:
+    """Count the points of the same sample within a radius of each centre; exact, in float64.
+
+    Args:
+        centres: ``(V, 3)``.
+        of_centre: ``(V,)`` int64 sample of each.
+        points: ``(K, 3)``.
+        of_point: ``(K,)`` int64 sample of each.
+        radius: metres.
+
+    Returns:
+        ``(V,)`` int64.
+    """
+    count = torch.zeros(len(centres), dtype=torch.int64, device=centres.device)
+    reach = radius + 1e-3
+    for sample in of_centre.unique().tolist():
+        rows = torch.nonzero(of_centre == sample)[:, 0]
+        rows = rows[centres[rows, 0].argsort()]
+        cloud = points[of_point == sample].double()
+        cloud = cloud[cloud[:, 0].argsort()]
+        x = cloud[:, 0].contiguous()
+        for some in rows.split(VOXELS_AT_ONCE):  # neighbours in x, so only a strip of points can be near
+            near = centres[some].double()
+            edges = torch.stack((near[0, 0] - reach, near[-1, 0] + reach))
+            first, last = torch.searchsorted(x, edges).tolist()
+            squared = (near[:, None] - cloud[None, first:last]).square().sum(dim=2)  # (R, S)
+            count[some] = (squared <= radius * radius + TOLERANCE).sum(dim=1)
+    return count
+
+
+class DensityBranch(nn.Module):
+    """Count around every voxel at several radii, condense the counts by sparse convolutions, lay them onto the map.
+
+    Three strided convolutions reach the resolution of :class:`beambox.layers.encoders.VoxelEncoder`'s map; they have
+    its kernels, strides and paddings, so their kernel maps are found once for both.
     """
 
+    def __init__(
+        self,
+        radii: Sequence[float] = (0.6, 1.8),
+        depth: int = 16,
+        count_set: CountSet | str = CountSet.VOXELS,
+        normalisation: Normalisation | str = Normalisation.LOG_SHARE,
+        max_count: int | None = None,
+        own_points: int | None = None,
+        collapse: bool = False,
+    ) -> None:
+        """Build the branch.
+
+        Args:
+            radii: metres, one channel each.
+            depth: channels of each convolution.
+            count_set: what is counted.
+            normalisation: what becomes of a count.
+            max_count: counts stop here, as in a ball query that gathers so many; None counts all.
+            own_points: the most points a voxel keeps, to add a channel for those it has; None for no such channel.
+            collapse: halve the height once more by a further convolution.
+        """
+        super().__init__()
+        if not radii or min(radii) <= 0:
+            raise BeamboxError(f"`radii` must name at least one length above 0, got {tuple(radii)}")
+        if max_count is not None and max_count < 1:
+            raise BeamboxError(f"`max_count` must be at least 1 (a voxel counts itself), or none; got {max_count}")
+        self.radii = tuple(radii)
+        self.count_set = chosen("count_set", count_set, CountSet)
+        self.normalisation = chosen("normalisation", normalisation, Normalisation)
+        self.max_count = max_count
+        self.own_points = own_points
+        self.depth = depth
+        channels = len(self.radii) + (own_points is not None)
+        layers = [
+            sparse_block(channels, depth, 3, 2, (1, 1, 1)),
+            sparse_block(depth, depth, 3, 2, (1, 1, 1)),
+            sparse_block(depth, depth, 3, 2, (0, 1, 1)),
+        ]
+        if collapse:
+            layers.append(sparse_block(depth, depth, (3, 1, 1), (2, 1, 1), 0))
+        self.layers = nn.Sequential(*layers)
+
+    def bev_channels(self, levels: int) -> int:
+        """Return the map's channels for a grid of so many height levels: those left times ``depth``."""
+        return self.depth * levels_left(self.layers, levels + 1)
+
+    def forward(self, sites: Sites, voxels: Voxels) -> Tensor:
+        """Return the density map ``(B, depth * Z / 8, Y / 8, X / 8)``.
+
+        Args:
+            sites: of the voxels, as the encoder sees them.
+            voxels: the same voxels with their points.
+        """
+        features = self.features(sites, voxels).to(voxels.points.dtype)  # (V, radii)
+        return self.layers(SparseTensor(features, sites)).to_bev()
+
+    @torch.no_grad()
+    def features(self, sites: Sites, voxels: Voxels) -> Tensor:
+        """Return each voxel's densities ``(V, radii)``, and with ``own_points`` its own, in the order of ``sites``."""
+        cell = voxels.grid.cell
+        counts = self.counts(sites, voxels).unbind(dim=1)
+        columns = [normalised(count, r, cell, self.normalisation) for count, r in zip(counts, self.radii)]
+        if self.own_points is not None:
+            row = torch.searchsorted(sites.sorted_keys, linear_keys(voxels.index, sites.shape))
+            own = torch.empty(len(sites), device=voxels.count.device)
+            own[sites.order[row]] = torch.log1p(voxels.count.float()) / math.log1p(self.own_points)
+            columns.append(own)
+        return torch.stack(columns, dim=1)
+
+    @torch.no_grad()
+    def counts(self, sites: Sites, voxels: Voxels) -> Tensor:
+        """Return how many voxels or points lie within each radius of each voxel's centre, ``(V, R)`` int64."""
+        if self.count_set is CountSet.VOXELS:
+            extent = (sites.batch_size, *sites.shape)
+            count = ball_counts(sites.indices, voxels.grid.cell, self.radii, extent)
+        else:
+            centres = voxels.grid.centre(sites.indices[:, 1:])
+            points, of_point, sample = voxels.points[:, :3], voxels.index[voxels.voxel, 0], sites.indices[:, 0]
+            count = [count_points(centres, sample, points, of_point, radius) for radius in self.radii]
+            count = torch.stack(count, dim=1)
+        return count if self.max_count is None else count.clamp(max=self.max_count)
+
+
+class AttentiveBackbone(nn.Module):
+    """Voxel R-CNN's 2-D network with both attentions in every stage (DenNet, section 3.3.2, figure 6)."""
+
     def __init__(self, in_channels: int, config: DenNetConfig) -> None:
-        super().__init__(in_channels, config.depths, config.strides, config.widths, config.up_strides, config.up_widths)
-        for i, (width, heads) in enumerate(zip(config.widths, config.na_heads)):
-            layers = list(self.stages[i].children())
-            if config.na:
-                at = len(layers) // 2 if config.na_position is AttentionPosition.MIDDLE else len(layers)
-                block = NeighborhoodBlock(width, heads, config.na_window, config.na_mlp, config.na_ratio)
-                layers.insert(at, block)
-            if config.ca:
-                layers.append(CoordinateAttention(width, config.ca_reduction))
-            self.stages[i] = nn.Sequential(*layers)
+        super().__init__()
+        expect_levels_meet(config.strides, config.up_strides)
+        inputs = (in_channels, *config.widths[:-1])
+        self.stages = nn.ModuleList(AttentiveStage(inputs[i], config, i) for i in range(len(inputs)))
+        self.ups = nn.ModuleList(
+            deconv_bn_relu(width, up_width, up_stride, up_stride)
+            for width, up_width, up_stride in zip(config.widths, config.up_widths, config.up_strides)
+        )
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, 256, Y, X)``: stages downwards, all enlarged and joined."""
+        levels = []
+        for stage, up in zip(self.stages, self.ups):
+            bev = stage(bev)  # (B, 64, Y, X), then (B, 128, Y / 2, X / 2)
+            levels.append(up(bev))  # (B, 128, Y, X)
+        return join_levels(levels)
+
+
+class AttentiveStage(nn.Module):
+    """One stage of figure 6: six convolutions, neighbourhood attention, coordinate attention."""
+
+    def __init__(self, in_channels: int, config: DenNetConfig, stage: int) -> None:
+        super().__init__()
+        width, heads = config.widths[stage], config.na_heads[stage]
+        layers = [conv_bn_relu(in_channels, width, stride=config.strides[stage])]
+        layers += [conv_bn_relu(width, width) for _ in range(config.depths[stage])]
+        middle = config.na and config.na_position is AttentionPosition.MIDDLE
+        before = len(layers) // 2 if middle else len(layers)
+        self.convolutions = nn.Sequential(*layers[:before])
+        block = NeighborhoodBlock(width, heads, config.na_window, config.na_mlp, config.na_ratio) if config.na else None
+        self.na = block or nn.Identity()
+        self.further = nn.Sequential(*layers[before:])  # none, unless NA stands in the middle
+        self.ca = CoordinateAttention(width, config.ca_reduction) if config.ca else nn.Identity()
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, C, Y / s, X / s)``."""
+        bev = self.convolutions(bev)  # (B, C, Y / s, X / s)
+        bev = self.na(bev)
+        bev = self.further(bev)
+        return self.ca(bev)
+
+
+def names_since(config: DenNetConfig) -> dict[str, str]:
+    """Return what the layers of a stage were called in 0.1.0, where a stage was a flat list, and are called now."""
+    names: dict[str, str] = {}
+    for i, depth in enumerate(config.depths):
+        middle = config.na and config.na_position is AttentionPosition.MIDDLE
+        before = (depth + 1) // 2 if middle else depth + 1
+        now = [f"convolutions.{k}" for k in range(before)] + ["na"] * config.na
+        now += [f"further.{k}" for k in range(depth + 1 - before)] + ["ca"] * config.ca
+        names |= {f"backbone.stages.{i}.{k}.": f"backbone.stages.{i}.{name}." for k, name in enumerate(now)}
+    return names
+
+
+class NeighborhoodAttention(nn.Module):
+    """Let each pixel attend to the ``window`` x ``window`` pixels around it, in several heads."""
+
+    def __init__(self, channels: int, heads: int, window: int = 7) -> None:
+        super().__init__()
+        if heads < 1 or channels % heads:
+            raise BeamboxError(f"`heads` must divide the {channels} channels, got {heads}")
+        self.heads = heads
+        self.window = window
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.bias = nn.Parameter(torch.empty(heads, 2 * window - 1, 2 * window - 1))
+        self.out = nn.Linear(channels, channels)
+        nn.init.trunc_normal_(self.bias, std=0.02)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Map ``(B, H, W, C)`` to the same shape; a map smaller than the window is padded with zeros meanwhile."""
+        height, width, channels = pixels.shape[1:]
+        below, beside = max(0, self.window - height), max(0, self.window - width)
+        padded = functional.pad(pixels, (0, 0, 0, beside, 0, below)) if below or beside else pixels
+        qkv = self.qkv(padded).unflatten(-1, (3, self.heads, channels // self.heads))  # (B, H, W, 3, heads, d)
+        q, k, v = qkv.permute(3, 0, 4, 1, 2, 5).unbind(dim=0)  # each (B, heads, H, W, d)
+        attended = neighborhood_attention(q, k, v, self.bias.to(q.dtype), self.window)
+        attended = attended.permute(0, 2, 3, 1, 4).flatten(3)  # (B, H, W, C)
+        return self.out(attended[:, :height, :width])
+
+
+class NeighborhoodBlock(nn.Module):
+    """A transformer block with neighbourhood attention: ``y = x + NA(LN(x))``, ``z = y + MLP(LN(y))``.
+
+    The multilayer perceptron, ``ratio`` times as wide as the map, is optional.
+    """
+
+    def __init__(self, channels: int, heads: int, window: int = 7, mlp: bool = True, ratio: int = 3) -> None:
+        super().__init__()
+        self.channels = channels
+        self.norm = nn.LayerNorm(channels)
+        self.attention = NeighborhoodAttention(channels, heads, window)
+        self.mlp = None
+        if mlp:
+            self.mlp = nn.Sequential(
+                nn.LayerNorm(channels),
+                nn.Linear(channels, ratio * channels),
+                nn.GELU(),
+                nn.Linear(ratio * channels, channels),
+            )
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, C, H, W)`` to the same shape."""
+        expect_shape("bev", bev, (None, self.channels, None, None))
+        pixels = bev.permute(0, 2, 3, 1)  # (B, H, W, C)
+        pixels = pixels + self.attention(self.norm(pixels))
+        pixels = pixels if self.mlp is None else pixels + self.mlp(pixels)
+        return pixels.permute(0, 3, 1, 2)
+
+
+class CoordinateAttention(nn.Module):
+    """Weigh ``(B, C, H, W)`` by two gates, one a channel and row and one a channel and column.
+
+    Rows and columns are averaged over the whole map, so the answer at a place depends on the region.
+    """
+
+    def __init__(self, channels: int, reduction: int = 32) -> None:
+        super().__init__()
+        self.channels = channels
+        hidden = max(8, channels // reduction)
+        self.shared = nn.Sequential(
+            nn.Conv2d(channels, hidden, 1), nn.BatchNorm2d(hidden, eps=BN_EPS, momentum=BN_MOMENTUM), nn.Hardswish()
+        )
+        self.rows = nn.Conv2d(hidden, channels, 1)
+        self.columns = nn.Conv2d(hidden, channels, 1)
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Return ``bev`` weighed, of the same shape."""
+        expect_shape("bev", bev, (None, self.channels, None, None))
+        height, width = bev.shape[-2:]
+        rows = bev.mean(dim=3, keepdim=True)  # (B, C, H, 1)
+        columns = bev.mean(dim=2, keepdim=True).transpose(2, 3)  # (B, C, W, 1)
+        hidden = self.shared(torch.cat((rows, columns), dim=2))  # (B, m, H + W, 1)
+        rows, columns = hidden.split((height, width), dim=2)
+        by_row = torch.sigmoid(self.rows(rows))  # (B, C, H, 1)
+        by_column = torch.sigmoid(self.columns(columns)).transpose(2, 3)  # (B, C, 1, W)
+        return bev * by_row * by_column
 
 
 def dennet(config: DenNetConfig | None = None) -> DenNet:

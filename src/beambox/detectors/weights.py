@@ -5,8 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import logging
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +16,10 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import build, config_to_dict, name_of
+from beambox.detectors.catalogue import build, config_to_dict, name_of, tensors_since
+from beambox.io import write_bytes
 
-__all__ = ["WeightFile", "load_weights", "read_weights", "save_weights", "write_atomically"]
+__all__ = ["WeightFile", "load_weights", "read_weights", "save_weights"]
 
 FORMAT = "beambox-weights-1"
 
@@ -39,25 +38,6 @@ class WeightFile:
     """Where the weights come from: data, recipe, licence, scores."""
     tensors: dict[str, Tensor]
     """Parameters and buffers."""
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it is either whole or absent: to a temporary name beside it, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        Path(temporary).unlink(missing_ok=True)
-        raise BeamboxError(f"cannot write {path}: {error.strerror or error}; nothing was left behind") from error
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def save_weights(
@@ -90,7 +70,7 @@ def save_weights(
         "config": json.dumps(config_to_dict(getattr(model, "config")), sort_keys=True),  # noqa: B009
         "card": json.dumps(dict(card or {}), sort_keys=True),
     }
-    write_atomically(Path(path), save(values, metadata=header))
+    write_bytes(Path(path), save(values, metadata=header), sync=True)
 
 
 def read_weights(path: str | Path) -> WeightFile:
@@ -145,7 +125,7 @@ def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
     Raises:
         BeamboxError: naming the first tensor that is missing, unknown or of another shape.
     """
-    own = model.state_dict()
+    own, tensors = model.state_dict(), tensors_since(model, tensors)
     missing, unknown = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
     if missing or unknown:
         said = [f"lacks {missing[0]} and {len(missing) - 1} more"] if missing else []

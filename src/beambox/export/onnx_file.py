@@ -24,10 +24,10 @@ from beambox import __version__
 from beambox.checks import BeamboxError, how_to_install
 from beambox.detectors.catalogue import config_to_dict, name_of
 from beambox.detectors.hcnet import HCNet
-from beambox.detectors.pointpillars import PointPillars, PointPillarsConfig
-from beambox.detectors.weights import write_atomically
+from beambox.detectors.pointpillars import PointPillars
 from beambox.export.onnx_check import TOLERANCE, Differences, compare, runtime_is_there, synthetic_sweep
 from beambox.geometry.grid import VoxelGrid
+from beambox.io import write_bytes
 from beambox.ops.voxelize import Voxels
 
 __all__ = ["OPSETS", "DenseGraph", "Written", "export_onnx"]
@@ -125,7 +125,7 @@ def export_onnx(
         for name, points in {**everything, **(sweeps or {})}.items():
             checks.append(compare(content, detector, points, name))
             expect_agreement(checks[-1])
-    write_atomically(path, content)
+    write_bytes(path, content, sync=True)
     return Written(path, len(content), shapes(proto.graph.input), shapes(proto.graph.output), tuple(checks))
 
 
@@ -195,7 +195,7 @@ def described(detector: PointPillars | HCNet, grid: VoxelGrid, card: Mapping[str
         "grid": asdict(grid),
         "cells": list(grid.size),
         "max_points": config.max_points,
-        "max_voxels": config.max_pillars if isinstance(config, PointPillarsConfig) else config.max_voxels,
+        "max_voxels": config.max_voxels,
         "post": asdict(config.post),
         "config": config_to_dict(config),
         "card": dict(card),

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from beambox.data.files import write_text
 from beambox.data.kitti import write_kitti_frame, write_split
 from beambox.infer.predictor import Detector
 from beambox.infer.results import write_results
+from beambox.io import write_text
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
 from beambox.simulate import SimulatedSource

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,7 @@ def evaluate_annotations(
     five_classes: bool = False,
     min_overlap: Mapping[str, float] | None = None,
     true_rotation: bool = False,
+    known: Collection[str] | None = None,
 ) -> OnceResult:
     """Score a file of annotations and predictions.
 
@@ -118,6 +120,7 @@ def evaluate_annotations(
         five_classes: as for :func:`evaluate`.
         min_overlap: as for :func:`evaluate`.
         true_rotation: as for :func:`evaluate`.
+        known: as for :func:`evaluate`.
 
     Raises:
         BeamboxError: naming the file and the key that cannot be used.
@@ -129,13 +132,17 @@ def evaluate_annotations(
         if results is None
         else _entries(_read(results), "predictions", results)
     )
-    found_by_id = {_frame_id(entry): entry for entry in founds}
-    known = {_frame_id(entry) for entry in truths}
-    missing = [name for name in known if name not in found_by_id]
     source = annotations if results is None else results
+    found_by_id = {_frame_id(entry): entry for entry in founds}
+    annotated = [_frame_id(entry) for entry in truths]
+    for where, names in ((annotations, annotated), (source, [_frame_id(entry) for entry in founds])):
+        repeated = next((name for name, count in Counter(names).items() if count > 1), None)
+        if repeated is not None:
+            raise BeamboxError(f"{where} must hold each frame once, but holds {repeated} again")
+    missing = [name for name in annotated if name not in found_by_id]
     if missing:
         raise BeamboxError(
-            f"{source}: {len(missing)} of {len(known)} annotated frames have no predictions, the first is "
+            f"{source}: {len(missing)} of {len(annotated)} annotated frames have no predictions, the first is "
             f"{min(missing)}; write an entry with empty lists where nothing was found"
         )
     pairs = []
@@ -143,7 +150,9 @@ def evaluate_annotations(
         name = _frame_id(entry)
         truth = _boxes(entry, f"{annotations}, ground truth of frame {name}", scored=False)
         pairs.append((truth, _boxes(found_by_id[name], f"{source}, predictions of frame {name}", scored=True)))
-    return evaluate_boxes(pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation)
+    return evaluate_boxes(
+        pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation, known=known
+    )
 
 
 def evaluate_boxes(
@@ -160,12 +169,14 @@ def evaluate_boxes(
     minima = _thresholds(FIVE_CLASSES if five_classes else SUPERCLASSES, min_overlap or {})
     merge = {} if five_classes else SUPERCLASS_OF
     all_classes = len(minima)
+    pairs, unknown = _with_known_names(pairs)
     if known is not None:
-        learned = {merge.get(name, name) for name in known}
+        learned = {merge.get(name, name) for name in (_KNOWN_NAMES.get(each.lower(), each) for each in known)}
         minima = {name: minimum for name, minimum in minima.items() if name in learned}
         if not minima:
+            all_names = dict.fromkeys((*SUPERCLASSES, *FIVE_CLASSES))
             raise BeamboxError(
-                f"ONCE's metric scores {', '.join(FIVE_CLASSES)}; the detector knows {', '.join(known) or 'no class'}"
+                f"ONCE's metric scores {', '.join(all_names)}; the detector knows {', '.join(known) or 'no class'}"
             )
     truth_name = np.array([merge.get(name, name) for truth, _ in pairs for name in truth.names], dtype=np.str_)
     found_name = np.array([merge.get(name, name) for _, found in pairs for name in found.names], dtype=np.str_)
@@ -199,7 +210,31 @@ def evaluate_boxes(
         values.append(tuple(_average_precision(table) for table in tables))
         objects.append(tuple(table.objects for table in tables))
     whole = len(minima) == all_classes
-    return OnceResult(tuple(minima), tuple(minima.values()), tuple(values), tuple(objects), len(pairs), whole)
+    return OnceResult(tuple(minima), tuple(minima.values()), tuple(values), tuple(objects), len(pairs), whole, unknown)
+
+
+_KNOWN_NAMES = {name.lower(): name for name in (*FIVE_CLASSES, *SUPERCLASSES)}
+ELSEWHERE = {"bicycle": "Cyclist", "motorcycle": "Cyclist", "person": "Pedestrian", "van": "Car"}
+"""Names that other data sets and toolboxes have for ONCE's classes."""
+
+
+def _with_known_names(
+    pairs: Sequence[tuple[OnceBoxes, OnceBoxes]],
+) -> tuple[list[tuple[OnceBoxes, OnceBoxes]], tuple[str, ...]]:
+    """Write names as ONCE does, whatever their case; the second value tells of names that it does not have."""
+    unknown: Counter[str] = Counter(
+        name for pair in pairs for side in pair for name in side.names if name.lower() not in _KNOWN_NAMES
+    )
+    told = []
+    for name, boxes in unknown.most_common():
+        meant = ELSEWHERE.get(name.lower())
+        hint = f' (did you mean "{meant}"?)' if meant else did_you_mean(name, FIVE_CLASSES)
+        told.append(f"{name}, {boxes} boxes{hint}")
+
+    def named(side: OnceBoxes) -> OnceBoxes:
+        return replace(side, names=tuple(_KNOWN_NAMES.get(name.lower(), name) for name in side.names))
+
+    return [(named(truth), named(found)) for truth, found in pairs], tuple(told)
 
 
 def gated_overlap(truth: Floats, found: Floats, true_rotation: bool = False) -> Floats:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from beambox.checks import BeamboxError
-from beambox.data.files import read_text
 from beambox.data.once import write_once_sequence, write_once_split
 from beambox.geometry.axes import Axes, turn_boxes
+from beambox.io import read_text
 from beambox.simulate.fleets import ONCE_FLEET
 from beambox.simulate.frames import simulate_frame
 from beambox.structures.frame import Frame

@@ -14,8 +14,8 @@ import numpy as np
 
 from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.files import read_text, write_text
 from beambox.data.kitti import write_kitti_frame, write_split
+from beambox.io import read_text, write_text
 from beambox.simulate.frames import VIEWS, simulate_frame
 from beambox.simulate.layouts import check_layout
 from beambox.simulate.once_files import OnceFiles

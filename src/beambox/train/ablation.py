@@ -15,8 +15,9 @@ from typing import Any
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
-from beambox.detectors.weights import load_weights, write_atomically
+from beambox.detectors.weights import load_weights
 from beambox.infer.evaluate import Detect, detect_frames, network, scored_frames
+from beambox.io import write_json
 from beambox.structures import Detections, Frame
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.loop import FINAL, LAST, train
@@ -185,11 +186,6 @@ def value_at(scores: Any, path: Sequence[str | int]) -> float | None:
         except (KeyError, IndexError):
             return None
     return scores
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all."""
-    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def report(table: Table, measured: Measured, ours: str = "") -> str:

@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.weights import write_atomically
+from beambox.io import write_bytes
 
 __all__ = ["Checkpoint", "load_checkpoint", "optimizer_state", "part", "restore_module", "restore_optimizer"]
 
@@ -47,7 +47,7 @@ class Checkpoint:
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors.items()}
         former = path.exists()
         try:
-            write_atomically(path, save(tensors, metadata))
+            write_bytes(path, save(tensors, metadata), sync=True)
         except BeamboxError as error:
             kept = "the former checkpoint is intact" if former else "no checkpoint was there before"
             raise BeamboxError(f"{error}; {kept}; free some space and go on with --resume") from error

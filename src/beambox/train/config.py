@@ -186,6 +186,9 @@ class Recipe(Section):
     """Scoring during the run; null for none."""
     ema: EmaSection | None = EmaSection()
     """Averaging of the weights; null for none."""
+    batchnorm_batches: int = Field(default=60, ge=0)
+    """Before each validation and export the batch norms' statistics are measured anew, exactly, over the batches of
+    this many last steps, for the weights that are scored and written; 0 keeps the moving averages of training."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """Arithmetic of the network; ``auto`` takes bfloat16 where the device is fast at it, else float32."""
     window: tuple[int, int] | None = None

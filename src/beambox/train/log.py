@@ -13,7 +13,7 @@ from typing import IO, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from beambox.checks import how_to_install
+from beambox.checks import how_to_install, printable
 
 __all__ = ["Clock", "RunLog", "duration"]
 
@@ -90,7 +90,7 @@ class RunLog:
     def say(self, text: str) -> None:
         """Print a line."""
         if self.active:
-            self._console.print(text, markup=False)
+            self._console.print(printable(text), markup=False)
             if not self._console.is_terminal:
                 sys.stdout.flush()
 

@@ -19,8 +19,9 @@ from beambox import __version__
 from beambox.checks import BeamboxError
 from beambox.data.database import ObjectDatabase
 from beambox.data.mixture import MixedSource
-from beambox.detectors.catalogue import build, config_to_dict, name_of
+from beambox.detectors.catalogue import build, config_to_dict, name_of, tensors_since
 from beambox.detectors.weights import fill, read_weights, save_weights
+from beambox.train.batchnorm import measure_statistics, measured_statistics
 from beambox.train.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -68,9 +69,14 @@ class TrainStep(nn.Module):
 
     def forward(self, work: TrainingBatch) -> dict[str, Tensor]:
         """Return the named losses of a batch."""
-        predictions = self.detector(work.batch, work.grid)
+        predictions = self.detector(work.batch, work.grid, work.batch.labels)
         with torch.autocast(work.batch.points.device.type, enabled=False):
             return self.detector.loss(predictions, work.batch.labels)
+
+
+def random_seed(seed: int, step: int, rank: int) -> int:
+    """Seed of what a network draws at random in a step, such as dropout and the regions of a second stage."""
+    return (seed * 1_000_003 + step) * 4096 + rank
 
 
 class Run:
@@ -107,7 +113,7 @@ class Run:
             BeamboxError: if the loss is NaN or infinite, with its parts.
         """
         # Only layers that draw random numbers (dropout) need it; it makes them a function of the step, for resuming.
-        torch.manual_seed((self.recipe.seed * 1_000_003 + self.step) * 4096 + self.fabric.global_rank)
+        torch.manual_seed(random_seed(self.recipe.seed, self.step, self.fabric.global_rank))
         lr = apply_schedule(self.optimizer.optimizer, self.recipe.optim, self.step, self.total)
         with clock.measure("forward"):
             losses = self.module(work.to(self.fabric.device))
@@ -159,10 +165,11 @@ class Run:
         own = self.identity()
         if saved.detector["name"] != own["name"]:
             raise BeamboxError(f"{path} is of the detector {saved.detector['name']}, the recipe is of {own['name']}")
-        restore_module(self.detector, part(saved.tensors, "model."), str(path))
-        restore_optimizer(self.optimizer.optimizer, self.names, part(saved.tensors, "optim."))
+        tensors = tensors_since(self.detector, saved.tensors)
+        restore_module(self.detector, part(tensors, "model."), str(path))
+        restore_optimizer(self.optimizer.optimizer, self.names, part(tensors, "optim."))
         if self.ema and "ema_updates" in saved.state:
-            restore_module(self.ema.module, part(saved.tensors, "ema."), str(path))
+            restore_module(self.ema.module, part(tensors, "ema."), str(path))
             self.ema.updates = saved.state["ema_updates"]
         if saved.state["precision"]:
             self.fabric.strategy.precision.load_state_dict(saved.state["precision"])
@@ -170,15 +177,42 @@ class Run:
         now = self.recipe.model_dump(mode="json")
         return [key for key in now if now[key] != saved.recipe.get(key)]
 
+    @contextmanager
+    def measured(self) -> Iterator[None]:
+        """Inside, the batch norms of ``result`` hold exact statistics of training batches, the same in every process.
+
+        The batches are those of the last steps, so what is measured is a function of the weights, the seed and the
+        step. All processes enter together.
+        """
+        with measured_statistics(self.result, self._measure):
+            yield
+
+    def _measure(self) -> None:
+        first = max(0, self.step - self.recipe.batchnorm_batches)
+        if first == self.step:
+            return
+        network, seed, rank = TrainStep(self.result), self.recipe.seed, self.fabric.global_rank
+        numbered = enumerate(stream(self.feed, first, self.step, self.recipe.workers), first)
+
+        def forward(work: tuple[int, TrainingBatch]) -> None:
+            torch.manual_seed(random_seed(seed, work[0], rank))  # a second stage draws its regions
+            with self.fabric.autocast():
+                network(work[1].to(self.fabric.device))
+
+        gather = self.fabric.all_gather if self.fabric.world_size > 1 else None
+        measure_statistics(self.result, numbered, forward, gather)  # pyright: ignore[reportArgumentType]
+
     def export(self, name: str, scores: Mapping[str, Any]) -> Path:
-        """Write the weights a user loads, with a card of where they come from."""
+        """Write the weights a user loads, with a card of where they come from (by the first process alone)."""
+        if self.fabric.global_rank != 0:
+            return self.folder / name
         recipe = self.recipe.model_dump(mode="json", exclude={"workers", "threads", "log_every", "save_every"})
         card = {"name": self.recipe.name, "step": self.step, "recipe": recipe, "beambox": __version__, **scores}
         save_weights(self.folder / name, self.result, card)
         return self.folder / name
 
     def validate(self, log: RunLog) -> None:
-        """Score the present weights and export them if they are the best so far."""
+        """Score the present weights, whose statistics are measured, and export them if they are the best so far."""
         if self.validator is None:
             return
         if self.fabric.global_rank == 0:
@@ -216,7 +250,8 @@ class Run:
                     if self.step % recipe.save_every == 0 and self.step < self.total:
                         self.save()
                     if recipe.validation and self.step % recipe.validation.every == 0 and self.step < self.total:
-                        self.validate(log)
+                        with self.measured():
+                            self.validate(log)
                 since += waiting.seconds.pop("other")
         return self.step == self.total
 
@@ -285,9 +320,10 @@ def train(
         finished = run.loop(log)
         run.save()
         if finished:
-            run.validate(log)
+            with run.measured():
+                run.validate(log)
+                final = run.export(FINAL, {})
             run.save()
-            final = run.export(FINAL, {})
             best = out / BEST
             log.say(f"finished; weights: {best if run.best is not None else final}")
             return Outcome(run.step, True, best if run.best is not None else final, run.best)

@@ -1,0 +1,76 @@
+"""Counts what a piece of code gives a device to do, and where it waits for an answer; on any device."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+READS = (
+    "_local_scalar_dense",
+    "item",
+    "equal",
+    "is_nonzero",
+    "nonzero",
+    "masked_select",
+    "unique_dim",
+    "unique_consecutive",
+    "unique_dim_consecutive",
+    "_unique",
+    "_unique2",
+    "bincount",
+)
+"""Operations whose answer, or the size of it, the host waits for."""
+
+
+class Launches(TorchDispatchMode):
+    """Counts operations that compute (views do not), bytes they touch, and reads by the host.
+
+    A copy to another device than the data's counts as a read where it goes to the CPU.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations: Counter[str] = Counter()
+        """By name."""
+        self.reads: Counter[str] = Counter()
+        """By name."""
+        self.bytes = 0
+        """Of all arguments and results, as if each operation read and wrote every one once."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        name = func.overloadpacket._qualified_op_name.split("::")[-1]
+        if is_view(func):
+            return out
+        self.operations[name] += 1
+        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        made = [leaf for leaf in tree_leaves(out) if isinstance(leaf, Tensor)]
+        self.bytes += sum(tensor.numel() * tensor.element_size() for tensor in (*given, *made))
+        if name in READS or reads_by_mask(name, given) or goes_home(name, given, made):
+            self.reads[name] += 1
+        return out
+
+
+def is_view(func: Any) -> bool:
+    """Whether an operation only looks at its argument in another way."""
+    results = func._schema.returns
+    return bool(results) and all(r.alias_info is not None and not r.alias_info.is_write for r in results)
+
+
+def reads_by_mask(name: str, given: list[Tensor]) -> bool:
+    """Whether an indexing operation is given a mask, whose true places must be counted first."""
+    return name in ("index", "index_put", "index_put_", "_index_put_impl_") and any(
+        t.dtype in (torch.bool, torch.uint8) for t in given[1:]
+    )
+
+
+def goes_home(name: str, given: list[Tensor], made: list[Tensor]) -> bool:
+    """Whether something is copied from a device to the CPU."""
+    if name == "copy_":
+        return given[0].device.type == "cpu" and given[-1].device.type != "cpu"
+    return name == "_to_copy" and bool(made) and made[0].device.type == "cpu" and given[0].device.type != "cpu"
