@@ -31,6 +31,7 @@ __all__ = [
     "exporting",
     "needs_gradient",
     "pinned",
+    "waiting_is_dear",
 ]
 
 BACKEND_NAMES = ("reference", "numba", "triton")
@@ -103,6 +104,14 @@ def pinned() -> str | None:
         known = ", ".join(BACKEND_NAMES)
         raise BeamboxError(f"BEAMBOX_BACKEND must be one of {known}, got {name!r}{did_you_mean(name, BACKEND_NAMES)}")
     return name or None
+
+
+def waiting_is_dear(tensor: Tensor) -> bool:
+    """Tell whether the host should not ask what a tensor holds: it would wait for all that a GPU was given before.
+
+    There sizes are kept fixed, and read once at the end. On the CPU exact sizes are faster.
+    """
+    return pinned() in (None, "triton") and can_run_triton(tensor) is None
 
 
 def choose(operation: str, backends: Sequence[Backend], *tensors: Tensor) -> Callable[..., Any]:

@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_numba, can_run_triton, choose, exporting
+from beambox.ops.dispatch import (
+    Backend,
+    always,
+    can_run_graph,
+    can_run_numba,
+    can_run_triton,
+    choose,
+    exporting,
+    waiting_is_dear,
+)
 from beambox.ops.scatter import graph, reference
 
 __all__ = ["scatter_bev", "segment_max", "segment_mean", "segment_sum"]
@@ -118,7 +127,7 @@ def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[in
     expect_shape("index", index, (len(features), 4))
     expect_dtype("index", index, torch.int64)
     ny, nx = size
-    if not exporting() and index.device.type == "cpu" and len(index):  # a GPU would have to be waited for
+    if len(index) and not exporting() and not waiting_is_dear(index):  # a GPU would have to be waited for
         low, high = index.amin(0).tolist(), index.amax(0).tolist()
         if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
             raise BeamboxError(
@@ -135,7 +144,7 @@ def _check(values: Tensor, segment: Tensor, size: int) -> None:
     expect_shape("segment", segment, (None,))
     expect_dtype("segment", segment, torch.int64)
     expect_same_length(values=len(values), segment=len(segment))
-    if not exporting() and segment.device.type == "cpu" and len(segment):  # a GPU would have to be waited for
+    if len(segment) and not exporting() and not waiting_is_dear(segment):  # a GPU would have to be waited for
         low, high = (int(value) for value in segment.aminmax())
         if low < 0 or high >= size:
             raise BeamboxError(f"`segment` must lie in 0 .. {size - 1} (size {size}), got {low} .. {high}")
