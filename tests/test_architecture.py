@@ -25,6 +25,7 @@ MAY_IMPORT = {
     "infer": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "zoo"},
     "train": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "infer"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
+    "track": {"infer", "data", "metrics", "structures", "geometry", "ops"},
     "zoo": set(),
 }
 GROUND_FLOOR = {"checks", "io"}
