@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "train": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "infer"},
     "report": {"infer", "data", "metrics", "visualise", "structures", "geometry", "ops"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
+    "track": {"infer", "data", "metrics", "structures", "geometry", "ops"},
     "zoo": set(),
 }
 # file -> folders that it may import besides, but inside its functions only: thin doors from a value to what draws and
