@@ -16,9 +16,14 @@ from beambox.cli.console import announce, progress, say, show_log
 if TYPE_CHECKING:
     from beambox.infer.inputs import Sweep
     from beambox.infer.predictor import Detector
-    from beambox.structures import Detections
+    from beambox.structures import Detections, Frame
 
 __all__ = ["command"]
+
+UNSEEN = 0.2
+"""Share of the points from which it is said that the network does not look at them."""
+REACH = 75.0
+"""Points farther than this to a side are no loss, metres."""
 
 
 def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
@@ -105,6 +110,9 @@ def detect_all(
             told = True
         for note in frame.notes:
             say(f"{sweep.name}: {note}")
+        if not told and (hint := unseen(detector, frame)):
+            say(hint)
+            told = True
         detections = detector.detect([frame])[0]
         detections = detections.above(min_score)
         written = write_results(out, frame, detections, kinds, model, sweep.name)
@@ -116,6 +124,23 @@ def detect_all(
         say(f"nothing found; `beambox doctor {sweeps[0].path} --model {model}` says why")
     if failed:
         raise BeamboxError(f"{failed} of {len(sweeps)} sweeps could not be read; the others are done")
+
+
+def unseen(detector: Detector, frame: Frame) -> str:
+    """Say how much of a sweep lies where the network does not look, and what to do; empty where that is little."""
+    prepared = detector.prepare(frame)
+    low, high = detector.grid.minimum, detector.grid.maximum
+    xy = prepared.points[:, :2]
+    near = xy.abs().amax(dim=1) <= REACH
+    outside = near & ((xy[:, 0] < low[0]) | (xy[:, 0] >= high[0]) | (xy[:, 1] < low[1]) | (xy[:, 1] >= high[1]))
+    share = float(outside.sum()) / max(1, len(xy))
+    if share < UNSEEN:
+        return ""
+    told = (
+        f"{share:.0%} of the points lie where the network does not look (x {low[0]:g} to {high[0]:g}, y {low[1]:g} to "
+        f"{high[1]:g} m): --range 50 looks all around"
+    )
+    return told + (", though these weights know only what lies there" if detector.config.absolute_xy else "")
 
 
 def counted(detections: Detections) -> str:

@@ -97,7 +97,9 @@ class KeptDetections:
             finite = bool(torch.isfinite(boxes).all() and torch.isfinite(scores).all())
             self.frames[name] = Detections(boxes, scores, class_ids, self.classes, name)
         except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise BeamboxError(f"{self.path}, line {number}: expected frame, boxes, scores, class_ids: {error}") from None
+            raise BeamboxError(
+                f"{self.path}, line {number}: expected frame, boxes, scores, class_ids: {error}"
+            ) from None
         if not finite:
             raise BeamboxError(f"{self.path}, line {number}: expected finite boxes and scores")
 
