@@ -238,7 +238,7 @@ def _posts(stage: Stage, line: _Line, side: float, count: int) -> None:
         x, y, direction = line.at(u, side * s)
         u += step
         if stage.sees(x, y):
-            stage.add_scenery(shape, x, y, direction + rng.normal(0, 0.3), gap=0.1)
+            stage.add_scenery(shape, x, y, direction + rng.normal(0, 0.3), gap=0.3)
 
 
 def _clutter(stage: Stage, line: _Line, side: float, edge: float, count: int) -> None:
