@@ -199,6 +199,7 @@ def main() -> None:
     groups = plan()
     if arguments.only:
         wanted = {"environment", "frames"}.union(*(word.split(",") for word in arguments.only))
+        wanted |= {"speed"} if wanted & {"latency", "train"} else set()
         groups = [g for g in groups if g.name in wanted or g.name.split(":")[0] in wanted]
     if arguments.list:
         print("\n".join(group.name for group in groups))

@@ -27,7 +27,7 @@ def recipe_of(name: str) -> Any:
     """Return a detector's recipe for KITTI, with all the width it has."""
     from beambox.train.config import read_recipe
 
-    return read_recipe(ROOT / "recipes" / f"{name.replace('_', '')}_kitti.yaml")
+    return read_recipe(f"{name}-kitti-3class")
 
 
 def full_width(name: str) -> nn.Module:
@@ -90,7 +90,7 @@ def agreement(got: Any, want: Any) -> dict[str, Any]:
         return told | {"ok": len(got) == len(want)}
     got = got.to("cpu")
     distance = (got.boxes[:, None] - want.boxes[None]).abs().amax(dim=2)
-    distance = torch.where(got.labels[:, None] == want.labels[None], distance, torch.inf)
+    distance = torch.where(got.class_ids[:, None] == want.class_ids[None], distance, torch.inf)
     nearest, row = distance.min(dim=1)
     same = nearest < 1e-2
     told["matched"] = int(same.sum())

@@ -80,14 +80,21 @@ class _Calls(TorchFunctionMode):
     def __init__(self, launches: Launches) -> None:
         super().__init__()
         self.launches = launches
+        self.home: dict[int, Tensor] = {}
+        """What was brought home, by its place, kept so that nothing else comes to lie there."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = getattr(func, "__name__", "")
-        if name in TAKEN_HOME:
-            self.launches.reads[name] += 1
         if name in SENT:
             self.launches.sent[name] += 1
-        return func(*args, **(kwargs or {}))
+        out = func(*args, **(kwargs or {}))
+        if name in TAKEN_HOME:
+            place = args[0].untyped_storage().data_ptr()
+            if place not in self.home:  # what was brought home is read there without waiting
+                self.launches.reads[name] += 1
+            if name == "cpu":
+                self.home[place] = out
+        return out
 
 
 def is_view(func: Any) -> bool:

@@ -7,7 +7,6 @@ few square metres. Kernels whose values decide nothing are not run: a launch is 
 import os
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -26,7 +25,6 @@ from beambox.structures import Batch
 from beambox.train.config import read_recipe
 from oracles.launches import Launches
 
-RECIPES = Path(__file__).resolve().parents[3] / "recipes"
 DECIDE = ("_spread", "_take_apart", "_stack", "_walk")
 MOST = 400
 """Operations and kernels of a pass, points to boxes."""
@@ -60,7 +58,7 @@ def kernels(monkeypatch):
 
 def shrunk(name):
     """The detector of the recipe for KITTI, all its layers, over 64 x 64 cells and with few proposals."""
-    recipe = read_recipe(RECIPES / f"{name.replace('_', '')}_kitti.yaml")
+    recipe = read_recipe(f"{name}-kitti-3class")
     config = build(recipe.detector.name, recipe.detector.options).config
     (x, y, z), cell = config.grid.minimum, config.grid.cell
     grid = VoxelGrid((x, -32 * cell[1], z), (x + 64 * cell[0], 32 * cell[1], config.grid.maximum[2]), cell)
