@@ -28,7 +28,7 @@ REACH = 75.0
 
 def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     inputs: options.InputsArgument,
-    model: options.ModelOption,
+    model: options.DefaultModelOption = "",
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
         "detections"
     ),
@@ -47,7 +47,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     """Find objects in sweeps; writes one result file a sweep.
 
     Examples:
-      beambox detect scan.bin --model pointpillars-sim
+      beambox detect scan.bin
       beambox detect kitti/training/velodyne --model run/best.safetensors --format kitti --out results
       beambox detect "drive/*.pcd" -m pointpillars-sim --range 50 --sensor-height 1.9 --axes "x: right, y: forward"
 
@@ -55,6 +55,15 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     format needs the sweep's calibration, found as ../calib/ID.txt beside velodyne/ID.bin. Nothing found at all?
     `beambox doctor scan.bin --model M` says why.
     """
+    from beambox.data.existence import expect_inputs
+    from beambox.zoo import DEFAULT
+
+    expect_inputs(inputs)  # before torch is loaded, which takes seconds
+    parsed_range, slope = options.parse_range(range_), options.parse_slope(ground_slope)
+    if not model:
+        model = DEFAULT
+        say(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
+
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
     from beambox.infer.results import choose_formats
@@ -68,11 +77,11 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         model,
         device=device,
         precision=precision,
-        range=options.parse_range(range_),
+        range=parsed_range,
         view=view,  # pyright: ignore[reportArgumentType]  # load checks it
         sensor_height=sensor_height,
         axes=axes or None,
-        ground_slope=options.parse_slope(ground_slope),
+        ground_slope=slope,
         intensity_scale=intensity_scale,
         fields=fields or None,
     )
@@ -105,7 +114,7 @@ def detect_all(
             say(hint)
             told = True
         detections = detector.detect([frame])[0]
-        detections = detections[detections.scores >= min_score]
+        detections = detections.above(min_score)
         written = write_results(out, frame, detections, kinds, model, sweep.name)
         found += len(detections)
         print(f"{sweep.name}: {counted(detections)} -> {', '.join(str(path) for path in written)}")
