@@ -12,7 +12,9 @@ __all__ = ["command"]
 
 def command(
     recipe: Annotated[Path, typer.Argument(help="YAML file of the run; the shipped ones lie in recipes/.")],
-    data: Annotated[Path | None, typer.Option(help="Folder that {data} stands for in the recipe.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="What {data} of the recipe stands for: a folder, or a YAML file.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME where not given.")] = None,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="Change a value: optim.lr=0.001; may be repeated.")
@@ -26,10 +28,11 @@ def command(
     from beambox.train.config import read_recipe
 
     parsed = read_recipe(recipe, change or [])
-    if data is not None and not data.is_dir():
+    if data is not None and not data.exists():
         from beambox.checks import MissingFileError
 
-        raise MissingFileError(f"--data: there is no folder {data}")
+        kind = "file" if data.suffix in (".yaml", ".yml") else "folder"
+        raise MissingFileError(f"--data: there is no {kind} {data}")
 
     from beambox.train.loop import train
 
