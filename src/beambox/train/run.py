@@ -60,6 +60,16 @@ def random_seed(seed: int, step: int, rank: int) -> int:
     return (seed * 1_000_003 + step) * 4096 + rank
 
 
+def _settle_strides(detector: nn.Module) -> None:
+    """Give kernels of one cell, whose order in memory has two descriptions, the one their gradients have.
+
+    DDP lays its buckets out by the parameters' strides and would copy every gradient that is described otherwise.
+    """
+    for parameter in detector.parameters():
+        if parameter.dim() == 4 and parameter.shape[2:] == (1, 1):
+            parameter.data = parameter.data.as_strided(parameter.shape, (parameter.shape[1], 1, 1, 1))
+
+
 class Run:
     """A detector in training: everything that changes from step to step, and how to save and restore it."""
 
@@ -79,6 +89,8 @@ class Run:
         detector.to(memory_format=torch.channels_last)
         if recipe.sync_batchnorm and fabric.world_size > 1 and fabric.device.type == "cuda":
             detector = nn.SyncBatchNorm.convert_sync_batchnorm(detector)
+        if fabric.world_size > 1:
+            _settle_strides(detector)
         self.module, self.optimizer = fabric.setup(TrainStep(detector), adam(detector.parameters(), optim))
         self.ema = Ema(detector, recipe.ema.decay) if recipe.ema else None
         self.names = {parameter: name for name, parameter in detector.named_parameters()}
