@@ -13,6 +13,7 @@ PUBLIC = (
     "Batch",
     "BeamboxError",
     "Calibration",
+    "Detection",
     "Detections",
     "Detector",
     "Frame",

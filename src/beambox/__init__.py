@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from beambox.infer.predictor import Detector as Detector
     from beambox.infer.predictor import load as load
     from beambox.structures import Batch as Batch
+    from beambox.structures import Detection as Detection
     from beambox.structures import Detections as Detections
     from beambox.structures import Frame as Frame
     from beambox.structures import Labels as Labels
@@ -30,6 +31,7 @@ _PUBLIC = {
     "Batch": "beambox.structures",
     "BeamboxError": "beambox.checks",
     "Calibration": "beambox.geometry.calibration",
+    "Detection": "beambox.structures",
     "Detections": "beambox.structures",
     "Detector": "beambox.infer.predictor",
     "Frame": "beambox.structures",

@@ -22,7 +22,7 @@ from beambox.train.loop import Run
 
 OPTIONS: dict[str, Any] = {
     "grid": {"minimum": [0.0, -6.4, -3.0], "maximum": [12.8, 6.4, 1.0], "cell": [0.4, 0.4, 4.0]},
-    "pillar_channels": 4,
+    "voxel_channels": 4,
     "depths": [1, 1],
     "strides": [2, 2],
     "widths": [8, 8],

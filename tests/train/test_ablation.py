@@ -91,7 +91,7 @@ def test_once_is_scored_by_its_own_rules(tmp_path: Path, opened: list[str]) -> N
 
 
 def test_the_once_recipe_reads_the_layout_of_once(tmp_path: Path) -> None:
-    made = read_recipe(ROOT / "recipes" / "hcnet_once.yaml")
+    made = read_recipe("hcnet-once")
     with pytest.raises(BeamboxError, match=r"must hold the folder data/ \(ONCE's layout\)"):
         open_source(made.data[0], tmp_path)
 
@@ -278,7 +278,7 @@ def test_time_is_told_after_warming_up(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_name_a_recipe_of_ours_and_options_that_exist(name: str) -> None:
     table = TABLES[name]
-    made = read_recipe(ROOT / "recipes" / f"{table.recipe}.yaml")
+    made = read_recipe(table.recipe)
     assert made.validation is not None
     configs = []
     for row in table.rows:
@@ -311,11 +311,9 @@ def test_published_numbers_can_be_read_without_training() -> None:
 def test_the_command_trains_and_prints(tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(TABLES, "tiny", TINY)
     monkeypatch.chdir(tmp_path)
-    Path("recipes").mkdir()
-    Path("recipes/tiny.yaml").write_text(json.dumps(tiny_recipe().model_dump(mode="json")), encoding="utf-8")
-    done = run_command(
-        "tiny", "--seeds", "0,4", "--iterations", "1", "--json", "numbers.json", "--set", "optim.batch=1"
-    )
+    Path("tiny.yaml").write_text(json.dumps(tiny_recipe().model_dump(mode="json")), encoding="utf-8")
+    words = ["--recipe", "tiny.yaml", "--seeds", "0,4", "--iterations", "1", "--set", "optim.batch=1"]
+    done = run_command("tiny", *words, "--json", "numbers.json")
     assert done.exit_code == 0, done.output
     assert "recipe tiny, 1 steps, batch 1, seeds 0,4; scored on `val`" in done.output
     numbers = json.loads(Path("numbers.json").read_text())
@@ -332,8 +330,7 @@ def test_seeds_must_be_different_whole_numbers(text: str) -> None:
 
 def test_a_missing_recipe_or_folder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    error = run_command("hcnet-table3").exception
-    assert "run this in the folder that holds recipes/, or give the file with --recipe" in str(error)
-    monkeypatch.chdir(ROOT)
+    error = run_command("hcnet-table3", "--recipe", "hcnet_smal").exception
+    assert 'no recipe is called "hcnet_smal" and no such file is there (did you mean "hcnet-small"?)' in str(error)
     error = run_command("hcnet-table3", "--data", str(tmp_path / "none")).exception
     assert str(error) == f"--data: there is no folder {tmp_path / 'none'}"

@@ -119,10 +119,9 @@ def test_the_documented_commands_fit_their_recipes() -> None:
     import re
 
     root = Path(__file__).resolve().parents[2]
-    commands = re.findall(
-        r"torchrun --nproc-per-node (\d+) .* train (\S+)(.*)", (root / "docs" / "training.md").read_text()
-    )
+    text = (root / "docs" / "training.md").read_text(encoding="utf-8")
+    commands = re.findall(r"torchrun --nproc-per-node (\d+) .* train (\S+)(.*)", text)
     assert len(commands) >= 2
-    for processes, path, rest in commands:
-        made = read_recipe(root / path, re.findall(r"--set (\S+)", rest))
+    for processes, name, rest in commands:
+        made = read_recipe(name, re.findall(r"--set (\S+)", rest))
         check_recipe(made, build(made.detector.name, made.detector.options).config, int(processes))

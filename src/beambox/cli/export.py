@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from beambox.checks import how_to_install
 from beambox.cli import options
 from beambox.cli.console import announce, show_log
 
@@ -58,4 +59,4 @@ def command(
             f"{found.scores:.1e} in scores, {found.boxes:.1e} in boxes (allowed {TOLERANCE:.0e}){turned}"
         )
     if not written.checks:
-        print("  not compared with PyTorch: onnxruntime is not installed (pip install 'beambox[export]')")
+        print(f"  not compared with PyTorch: onnxruntime is not installed ({how_to_install('export')})")

@@ -29,8 +29,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
+    "recipes": ("beambox.cli.recipes:command", "the shipped recipes: for whom, how long, whether ever run"),
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
+    "report": (
+        "beambox.cli.report:command",
+        "one page per evaluation: curves, errors, groups, worst failures as pictures",
+    ),
     "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
     "data": ("beambox.cli.data:app", "check a data set of one's own before training, and propose anchors for it"),
     "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),
@@ -46,7 +51,7 @@ EXAMPLES = (
     ("beambox show scan.bin --model pointpillars-sim --out scan.png", "and look at them"),
     ("beambox doctor scan.bin", "why are there no detections?"),
     ("beambox simulate data --frames 200 --seed 1", "make a labelled data set"),
-    ("beambox train recipes/pointpillars_small.yaml --data data --out run", "train on it"),
+    ("beambox train pointpillars-small --data data --out run", "train on it"),
     ("beambox evaluate run --data data", "and score the result"),
 )
 
@@ -102,8 +107,9 @@ def explain(error: OSError) -> str:
 
 def stop(message: str, status: int) -> NoReturn:
     """Print one line on stderr and leave."""
-    line = " ".join(message.split())
-    print(f"beambox: {line}", file=sys.stderr)
+    from beambox.cli.console import say
+
+    say("beambox: " + " ".join(message.split()))
     raise SystemExit(status)
 
 
@@ -147,7 +153,9 @@ def run(name: str, arguments: Sequence[str]) -> None:
         app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         settings = {"help_option_names": ["-h", "--help"]}
         app.command(name, help=help_of(command), context_settings=settings)(guard(command))
-    with terminated_as_interrupted():
+    from beambox.cli.console import plain_output
+
+    with plain_output(), terminated_as_interrupted():
         app(args=list(arguments), prog_name=f"beambox {name}")
 
 

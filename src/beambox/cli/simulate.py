@@ -33,13 +33,26 @@ def command(
         float, typer.Option(help="share of the sweeps (once: of the sequences) listed in ImageSets/val.txt")
     ] = 0.1,
     sequence_length: Annotated[int, typer.Option(help="once: sweeps in one sequence", min=1)] = 10,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder in KITTI's layout: print where the points of its objects and of ours lie in their boxes"
+        ),
+    ] = None,
 ) -> None:
     """Simulate labelled LiDAR sweeps. An interrupted or shorter data set is continued by the same command."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from beambox import __version__
+    from beambox.checks import BeamboxError
+    from beambox.data.kitti import KittiSource
     from beambox.simulate import write_dataset
+    from beambox.simulate.compare import compare_objects
+
+    if compare and files != "kitti":
+        raise BeamboxError(f"--compare reads KITTI's layout, and --format is {files}; leave one of the two out")
+    real = KittiSource(compare, "train", fov=True) if compare else None  # before an hour of simulation
 
     console = Console(stderr=True)
     told = ", ".join(f"{name} {value}" for name, value in (("sensor", sensor), ("view", view)) if value)
@@ -57,3 +70,5 @@ def command(
             files=files, sequence_length=sequence_length,
         )  # fmt: skip
     console.print(f"wrote {frames} frames to {out}")
+    if real:
+        print(compare_objects(real, KittiSource(out, "train", fov=True)).table(), end="")

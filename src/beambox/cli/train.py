@@ -11,31 +11,35 @@ __all__ = ["command"]
 
 
 def command(
-    recipe: Annotated[Path, typer.Argument(help="YAML file of the run; the shipped ones lie in recipes/.")],
+    recipe: Annotated[
+        str, typer.Argument(help="Name of a shipped recipe (`beambox recipes` lists them), or a YAML file.")
+    ],
     data: Annotated[
         Path | None, typer.Option(help="What {data} of the recipe stands for: a folder, or a YAML file.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME where not given.")] = None,
     change: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a value: optim.lr=0.001; may be repeated.")
+        list[str] | None,
+        typer.Option("--set", help="Change a value, in all stages: optim.lr=0.001; may be repeated."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the folder's last checkpoint.")] = False,
 ) -> None:
     """Train a detector.
 
-    On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox.cli.main train RECIPE --data DIR
-    """
-    from beambox.train.config import read_recipe
+    Examples:
+      beambox train pointpillars-small --data data --out run
+      beambox train mine.yaml --data data --set optim.lr=0.001
 
-    parsed = read_recipe(recipe, change or [])
+    On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox train RECIPE --data DIR
+    """
+    from beambox.train.stages import read_stages, train_stages
+
+    stages = read_stages(recipe, change or [])
     if data is not None and not data.exists():
         from beambox.checks import MissingFileError
 
         kind = "file" if data.suffix in (".yaml", ".yml") else "folder"
         raise MissingFileError(f"--data: there is no {kind} {data}")
-
-    from beambox.train.loop import train
-
-    outcome = train(parsed, data, out or Path("runs") / parsed.name, resume)
+    outcome = train_stages(stages, data, out or Path("runs") / stages[-1].name, resume)
     if not outcome.finished:
         raise typer.Exit(130)

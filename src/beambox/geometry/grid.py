@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError
+from beambox.geometry.constants import constant
 
 __all__ = ["VoxelGrid"]
 
@@ -58,17 +59,17 @@ class VoxelGrid:
         Returns:
             ``(N, 3)`` int64 cell index (z, y, x), meaningless where outside, and ``(N,)`` bool, inside.
         """
-        minimum = points.new_tensor(self.minimum)
-        cell = points.new_tensor(self.cell)
-        size = torch.tensor(self.size, device=points.device)
+        minimum = constant(self.minimum, points.device, points.dtype)
+        cell = constant(self.cell, points.device, points.dtype)
+        size = constant(self.size, points.device)
         xyz = torch.floor((points[:, :3] - minimum) / cell)  # (N, 3)
         inside = ((xyz >= 0) & (xyz < size)).all(dim=1)  # NaN compares false, so it is outside
         return torch.where(inside[:, None], xyz, 0.0).long().flip(1), inside
 
     def centre(self, index: Tensor) -> Tensor:
         """Return the geometric centres (x, y, z) of cells given as ``(..., 3)`` (z, y, x): ``(..., 3)`` float32."""
-        cell = torch.tensor(self.cell, device=index.device)
-        minimum = torch.tensor(self.minimum, device=index.device)
+        cell = constant(self.cell, index.device)
+        minimum = constant(self.minimum, index.device)
         return (index.flip(-1) + 0.5) * cell + minimum
 
     def contains(self, centres: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beambox.data.placements import up_axis
 from beambox.data.reading import read_frame
 from beambox.data.road import fit_road_plane, height_and_slope
 from beambox.geometry.axes import Axes
@@ -106,7 +107,7 @@ def _units(points: Tensor) -> Finding:
 
 def _axes(points: Tensor) -> tuple[Finding, Axes]:
     """Find which axis is up by the layer of the ground, and where the points lie if they do not lie all around."""
-    up = _up_axis(points)
+    up = up_axis(points)
     if up is not None:
         axes = _axes_from_up(up)
         text = f"the ground is a layer across the {up[-1]} axis and {up} is up, but the network takes +z for up"
@@ -122,26 +123,6 @@ def _axes(points: Tensor) -> tuple[Finding, Axes]:
     if quarter == 0:
         return Finding("axes", "good", text + ", ahead as expected"), axes
     return Finding("axes", "bad", text + ", but the network looks along +x", ("--axes", str(axes))), axes
-
-
-def _up_axis(points: Tensor) -> str | None:
-    """Return the axis that is up, such as "-y", or None where it is +z."""
-    xyz = points[:, :3].double().numpy()
-    xyz = xyz[np.abs(xyz).max(axis=1) < 50]
-    if len(xyz) < 500:
-        return None
-    spread = np.quantile(xyz, 0.95, axis=0) - np.quantile(xyz, 0.05, axis=0)
-    axis = int(spread.argmin())
-    if spread[axis] > 0.6 * np.sort(spread)[1]:
-        return None  # no axis is clearly the thin one
-    values = xyz[:, axis]
-    counts, edges = np.histogram(values, bins=np.arange(np.floor(values.min()), np.ceil(values.max()) + 0.1, 0.1))
-    ground = edges[counts.argmax()] + 0.05
-    # The ground is the densest layer, and what stands on it reaches farther than what lies below it.
-    above, below = np.quantile(values, 0.98) - ground, ground - np.quantile(values, 0.02)
-    sign = "+" if above >= below else "-"
-    found = sign + "xyz"[axis]
-    return None if found == "+z" else found
 
 
 def _axes_from_up(up: str) -> Axes:

@@ -121,7 +121,7 @@ class KeptDetections:
                 yield frame, self.frames[frame.id]
 
     def _keep(self, frame: Frame, found: Detections) -> None:
-        values = {"boxes": found.boxes.float(), "scores": found.scores.float(), "labels": found.labels}
+        values = {"boxes": found.boxes.float(), "scores": found.scores.float(), "labels": found.class_ids}
         self._append({"frame": frame.id, **{key: value.tolist() for key, value in values.items()}})
         self.frames[frame.id] = found
 

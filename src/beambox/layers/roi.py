@@ -22,6 +22,7 @@ __all__ = [
     "RoiSampling",
     "RoiTargets",
     "Rois",
+    "best_overlap",
     "canonical_targets",
     "corner_loss",
     "decode_rois",
@@ -132,7 +133,7 @@ def sample_rois(
             rows = torch.nonzero(rois.sample == sample)[:, 0]
             if len(rows) == 0:
                 continue
-            iou, best = _best_overlap(rois.boxes[rows], rois.labels[rows], boxes[sample], classes[sample])
+            iou, best = best_overlap(rois.boxes[rows], rois.labels[rows], boxes[sample], classes[sample])
             drawn = _draw(iou.cpu(), options, generator).to(rows.device)
             objects = boxes[sample].to(rois.boxes)
             chosen.append(rows[drawn])
@@ -146,8 +147,18 @@ def sample_rois(
         return RoiTargets(picked, torch.cat(matched), iou, overlap_score(iou, options), iou > options.positive_iou)
 
 
-def _best_overlap(rois: Tensor, labels: Tensor, boxes: Tensor, classes: Tensor) -> tuple[Tensor, Tensor]:
-    """Return each region's largest overlap with an object of its class, and that object."""
+def best_overlap(rois: Tensor, labels: Tensor, boxes: Tensor, classes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return each region's largest overlap with an object of its class, and that object.
+
+    Args:
+        rois: ``(R, 7)``.
+        labels: ``(R,)`` int64 classes of the regions.
+        boxes: ``(M, 7)`` objects.
+        classes: ``(M,)`` int64 classes of the objects.
+
+    Returns:
+        ``(R,)`` 3-D overlaps, 0 where there is none, and ``(R,)`` int64 objects, any where there is none.
+    """
     if len(boxes) == 0:
         return rois.new_zeros(len(rois)), labels.new_zeros(len(rois))
     iou = iou_3d(rois, boxes.to(rois))  # (R, M)

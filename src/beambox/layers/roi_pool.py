@@ -142,8 +142,10 @@ class RoiHead(nn.Module):
         if len(pooled) == 1 and self.training:  # batch statistics need two values: the region counts twice
             twice = self(pooled.expand(2, -1))
             return RoiPredictions(twice.cls[:1], twice.codes[:1])
-        shared = self.shared(pooled)
-        return RoiPredictions(self.cls(self.cls_layers(shared))[:, 0], self.box(self.box_layers(shared)))
+        shared = self.shared(pooled)  # (R, width)
+        cls, box = self.cls_layers(shared), self.box_layers(shared)
+        with torch.autocast(pooled.device.type, enabled=False):  # boxes to the millimetre: bfloat16 has three digits
+            return RoiPredictions(self.cls(cls.float())[:, 0], self.box(box.float()))
 
 
 def _connected(in_channels: int, width: int, dropout: float) -> nn.Sequential:

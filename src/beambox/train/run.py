@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from beambox import __version__
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import config_to_dict, name_of
+from beambox.detectors.catalogue import config_to_dict, name_of, tensors_since
 from beambox.detectors.weights import save_weights
 from beambox.infer.precision import PRECISIONS
 from beambox.train.batchnorm import measure_statistics, measured_statistics
@@ -50,7 +50,7 @@ class TrainStep(nn.Module):
 
     def forward(self, work: TrainingBatch) -> dict[str, Tensor]:
         """Return the named losses of a batch."""
-        predictions = self.detector(work.batch, work.grid)
+        predictions = self.detector(work.batch, work.grid, work.batch.labels)
         with torch.autocast(work.batch.points.device.type, enabled=False):
             return self.detector.loss(predictions, work.batch.labels)
 
@@ -192,10 +192,11 @@ class Run:
         own = self.identity()
         if saved.detector["name"] != own["name"]:
             raise BeamboxError(f"{path} is of the detector {saved.detector['name']}, the recipe is of {own['name']}")
-        restore_module(self.detector, part(saved.tensors, "model."), str(path))
-        restore_optimizer(self.optimizer.optimizer, self.names, part(saved.tensors, "optim."))
+        tensors = tensors_since(self.detector, saved.tensors)
+        restore_module(self.detector, part(tensors, "model."), str(path))
+        restore_optimizer(self.optimizer.optimizer, self.names, part(tensors, "optim."))
         if self.ema and "ema_updates" in saved.state:
-            restore_module(self.ema.module, part(saved.tensors, "ema."), str(path))
+            restore_module(self.ema.module, part(tensors, "ema."), str(path))
             self.ema.updates = saved.state["ema_updates"]
         if saved.state["precision"]:
             self.fabric.strategy.precision.load_state_dict(saved.state["precision"])

@@ -8,7 +8,8 @@ import torch
 from torch import nn
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalogue import build, tensors_since
+from beambox.detectors.renames import current_fields
 from beambox.detectors.weights import WeightFile, read_weights
 from beambox.infer.predictor import find_weights
 from beambox.train.config import DetectorSection
@@ -38,7 +39,7 @@ def build_detector(section: DetectorSection, seed: int) -> tuple[nn.Module, list
         raise BeamboxError(
             f"detector.start_from: {section.start_from} holds a {stored.detector}, the recipe trains a {section.name}"
         )
-    detector = _fresh(section.name, _over(stored.config, section.options), seed)
+    detector = _fresh(section.name, _over(current_fields(stored.config), current_fields(section.options)), seed)
     return detector, take_over(detector, stored, section.start_from)
 
 
@@ -64,8 +65,8 @@ def take_over(detector: nn.Module, stored: WeightFile, where: str) -> list[str]:
     Raises:
         BeamboxError: if none fits.
     """
-    own = detector.state_dict()
-    fitting = [name for name in own if name in stored.tensors and stored.tensors[name].shape == own[name].shape]
+    own, theirs = detector.state_dict(), tensors_since(detector, stored.tensors)
+    fitting = [name for name in own if name in theirs and theirs[name].shape == own[name].shape]
     weights = {name for name, _ in detector.named_parameters()}
     if not weights & set(fitting):
         raise BeamboxError(
@@ -73,13 +74,13 @@ def take_over(detector: nn.Module, stored: WeightFile, where: str) -> list[str]:
             "leave these options out to take those of the weights, or start without them"
         )
     for name in fitting:
-        own[name].copy_(stored.tensors[name])
+        own[name].copy_(theirs[name])
     lines = [f"started from {where}: {len(fitting)} of {len(own)} tensors"]
     fresh = [name for name in own if name not in fitting]
     if fresh:
         told = [
-            f"{name} {tuple(stored.tensors[name].shape)} -> {tuple(own[name].shape)}"
-            if name in stored.tensors
+            f"{name} {tuple(theirs[name].shape)} -> {tuple(own[name].shape)}"
+            if name in theirs
             else f"{name} (not in the weights)"
             for name in fresh
         ]

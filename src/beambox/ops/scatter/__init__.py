@@ -68,7 +68,7 @@ def segment_sum(values: Tensor, segment: Tensor, size: int) -> Tensor:
         ``(S, C)``; zero where a segment has no row.
 
     Raises:
-        BeamboxError: if a shape or type does not fit, or a segment is out of range.
+        BeamboxError: if a shape or type does not fit, or, on the CPU, a segment is out of range.
     """
     if torch.compiler.is_exporting():
         return graph.segment_sum(values, segment, size)
@@ -109,7 +109,7 @@ def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[in
         ``(B, C, ny, nx)``, zero where no voxel is; laid out channels last, as convolutions like it.
 
     Raises:
-        BeamboxError: if a shape or type does not fit, or an index leaves the map.
+        BeamboxError: if a shape or type does not fit, or, on the CPU, an index leaves the map.
     """
     if torch.compiler.is_exporting():
         return graph.scatter_bev(features, index, batch_size, size)
@@ -117,7 +117,7 @@ def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[in
     expect_shape("index", index, (len(features), 4))
     expect_dtype("index", index, torch.int64)
     ny, nx = size
-    if len(index):
+    if len(index) and index.device.type == "cpu":  # a GPU would have to be waited for
         low, high = index.amin(0).tolist(), index.amax(0).tolist()
         if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
             raise BeamboxError(
@@ -134,7 +134,7 @@ def _check(values: Tensor, segment: Tensor, size: int) -> None:
     expect_shape("segment", segment, (None,))
     expect_dtype("segment", segment, torch.int64)
     expect_same_length(values=len(values), segment=len(segment))
-    if len(segment):
+    if len(segment) and segment.device.type == "cpu":  # a GPU would have to be waited for
         low, high = (int(value) for value in segment.aminmax())
         if low < 0 or high >= size:
             raise BeamboxError(f"`segment` must lie in 0 .. {size - 1} (size {size}), got {low} .. {high}")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, linear_keys
 
-__all__ = ["convolve", "find_targets", "neighbour_table"]
+__all__ = ["convolve", "find_targets", "indices_of", "inverse_table", "neighbour_table"]
 
 
 def find_targets(source: Sites, geometry: Geometry) -> Tensor:
@@ -47,6 +47,23 @@ def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
         found = inside & (source.sorted_keys[slot] == key)
         table[:, k] = torch.where(found, source.order[slot], -1).int()
     return table
+
+
+def inverse_table(forward: Tensor, rows: int) -> Tensor:
+    """Read a ``(V_out, K)`` table from output to input: ``(rows, K)`` int32."""
+    back = torch.full((rows, forward.shape[1]), -1, dtype=torch.int32, device=forward.device)
+    out_row, offset = torch.nonzero(forward >= 0, as_tuple=True)  # each (input, offset) pair occurs once
+    back[forward[out_row, offset].long(), offset] = out_row.int()
+    return back
+
+
+def indices_of(sites: Sites) -> Tensor:
+    """Return ``(V, 4)`` int64 (b, z, y, x) of each row."""
+    nz, ny, nx = sites.shape
+    rest, x = sites.sorted_keys // nx, sites.sorted_keys % nx
+    rest, y = rest // ny, rest % ny
+    ascending = torch.stack((rest // nz, rest % nz, y, x), dim=1)
+    return torch.empty_like(ascending).index_copy_(0, sites.order, ascending)
 
 
 def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
+from beambox.ops.dispatch import Backend, always, can_run_triton, choose
 
 if TYPE_CHECKING:
     from beambox.ops.sparse_conv.cpu_maps import BlockPairs
@@ -81,6 +83,47 @@ class Geometry:
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
 
 
+def _table() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.reference import neighbour_table
+
+    return neighbour_table
+
+
+def _inverse() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.reference import inverse_table
+
+    return inverse_table
+
+
+def _indices() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.reference import indices_of
+
+    return indices_of
+
+
+def _triton_table() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.gpu_maps import neighbour_table
+
+    return neighbour_table
+
+
+def _triton_inverse() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.gpu_maps import inverse_table
+
+    return inverse_table
+
+
+def _triton_indices() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.gpu_maps import indices_of
+
+    return indices_of
+
+
+TABLE_BACKENDS = (Backend("triton", can_run_triton, _triton_table), Backend("reference", always, _table))
+INVERSE_BACKENDS = (Backend("triton", can_run_triton, _triton_inverse), Backend("reference", always, _inverse))
+INDEX_BACKENDS = (Backend("triton", can_run_triton, _triton_indices), Backend("reference", always, _indices))
+
+
 @dataclass(frozen=True, eq=False)
 class KernelMap:
     """Which input site feeds which output site through which kernel offset; found when first asked for."""
@@ -103,16 +146,12 @@ class KernelMap:
     def table(self) -> Tensor:
         """``(V_out, K)`` int32 row of the input site that reaches an output through an offset, or -1."""
         if self.mirror is None:
-            from beambox.ops.sparse_conv.reference import neighbour_table
-
-            return neighbour_table(self.source, self.target, self.geometry)
+            look_up = choose("neighbour_table", TABLE_BACKENDS, self.source.sorted_keys)
+            return look_up(self.source, self.target, self.geometry)
         forward = self.mirror.table
         if self.geometry.submanifold:
             return forward.flip(1).contiguous()  # a centred kernel mirrors itself
-        back = torch.full((len(self.target), forward.shape[1]), -1, dtype=torch.int32, device=forward.device)
-        out_row, offset = torch.nonzero(forward >= 0, as_tuple=True)  # each (input, offset) pair occurs once
-        back[forward[out_row, offset].long(), offset] = out_row.int()
-        return back
+        return choose("inverse_table", INVERSE_BACKENDS, forward)(forward, len(self.target))
 
     @cached_property
     def blocks(self) -> BlockPairs:
@@ -143,11 +182,7 @@ class Sites:
     @cached_property
     def indices(self) -> Tensor:
         """``(V, 4)`` int64 (b, z, y, x) of each row."""
-        _, ny, nx = self.shape
-        rest, x = self.sorted_keys // nx, self.sorted_keys % nx
-        rest, y = rest // ny, rest % ny
-        ascending = torch.stack((rest // self.shape[0], rest % self.shape[0], y, x), dim=1)
-        return torch.empty_like(ascending).index_copy_(0, self.order, ascending)
+        return choose("site_indices", INDEX_BACKENDS, self.sorted_keys)(self)
 
     def __len__(self) -> int:
         return len(self.sorted_keys)
@@ -182,6 +217,12 @@ class Sites:
                 f"`indices` must name each site once, got {len(twice)} repeated, first (b, z, y, x) = {row}; "
                 "merge the points of a cell before (voxelize does)"
             )
+        return cls(sorted_keys, order, shape, batch_size)
+
+    @classmethod
+    def trusted(cls, indices: Tensor, shape: Triple, batch_size: int) -> Sites:
+        """Return sites from int64 indices (b, z, y, x) that are known to lie inside, none twice: nothing is read."""
+        sorted_keys, order = torch.sort(linear_keys(indices, shape))
         return cls(sorted_keys, order, shape, batch_size)
 
     @classmethod
