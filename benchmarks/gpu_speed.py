@@ -174,6 +174,7 @@ def work_of(subject: Subject, batch: Any) -> dict[str, Any]:
 
     from beambox.ops import sparse_conv
     from beambox.ops.neighborhood import neighborhood_attention as attend
+    from beambox.ops.sparse_conv.pairs import input_rows
     from oracles.launches import Launches
 
     own = {"flop": 0.0, "bytes": 0.0}
@@ -181,7 +182,7 @@ def work_of(subject: Subject, batch: Any) -> dict[str, Any]:
 
     def counted_convolve(features: Tensor, weight: Tensor, bias: Any, pairs: Any) -> Tensor:
         out = convolve(features, weight, bias, pairs)
-        table = pairs.table
+        table = pairs.kept(input_rows)
         own["flop"] += 2.0 * int((table >= 0).sum()) * weight[0, 0, 0].numel()
         own["bytes"] += sum(t.numel() * t.element_size() for t in (features, weight, out, table))
         return out

@@ -244,10 +244,10 @@ def test_columns_find_their_numbers_in_a_kitti_result() -> None:
         return tuple(AveragePrecision(first + i, first + 10 + i, 0.0, ()) for i in range(3))
 
     car = ClassResult("Car", 0.7, (9, 9, 9), averages(10), averages(30), averages(50), averages(70))
-    scores = KittiResult((car,), ("easy", "moderate", "hard"), 5).to_json()
+    scores = {**KittiResult((car,), ("easy", "moderate", "hard"), 5).to_json(), "time": {"ms": 32.0}}
     table = table_of("hcnet-table2")
     found = [value_at(scores, column.path) for column in table.columns]
-    assert found == [30, 31, 32, 10, 11, 12, 70, 71, 72]
+    assert found == [30, 31, 32, 10, 11, 12, 70, 71, 72, 32.0]
     assert [value_at(scores, c.path) for c in levels("Car", "3d", "R11")] == [20, 21, 22]
     assert value_at(scores, ("Cyclist", "3d", "R11", 0)) is None
 
@@ -334,3 +334,17 @@ def test_a_missing_recipe_or_folder_is_said(tmp_path: Path, monkeypatch: pytest.
     assert 'no recipe is called "hcnet_smal" and no such file is there (did you mean "hcnet-small"?)' in str(error)
     error = run_command("hcnet-table3", "--data", str(tmp_path / "none")).exception
     assert str(error) == f"--data: there is no folder {tmp_path / 'none'}"
+
+
+def test_the_papers_tables_hold_what_they_print() -> None:
+    def row(table: str, name: str) -> tuple[float | None, ...]:
+        return next(row.published for row in table_of(table).rows if row.name == name)
+
+    assert row("dennet-table1", "DenNet") == (90.72, 81.93, 77.48, 46.10, 40.23, 33.47, 78.89, 64.15, 56.81)
+    assert row("dennet-table2", "Voxel R-CNN") == (92.86, 85.13, 82.84, 69.37, 61.56, 56.39, 91.63, 74.52, 70.25)
+    assert row("dennet-table2", "PV-RCNN") == row("dennet-table1", "PV-RCNN"), "as printed, and remarked upon"
+    assert row("kassd-table1", "KASSD") == (88.92, 79.75, 72.17) and len(table_of("kassd-table1").rows) == 18
+    assert row("kassd-table2", "CIA-SSD") == (90.04, 79.81, 78.80) and len(table_of("kassd-table2").rows) == 22
+    assert [r.published for r in table_of("kassd-table7").rows] == [(643.0,), (60.0,), (46.3,), (38.0,), (45.9,)]
+    assert row("hcnet-table1", "PointPillars") == (87.50, 77.01, 74.77, 16.0)
+    assert row("hcnet-table2", "HCNet")[-1] == 32.0

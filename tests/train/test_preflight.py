@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameList
@@ -19,6 +21,7 @@ from beambox.train import loop
 from beambox.train.config import parse_recipe
 from beambox.train.loop import train
 from beambox.train.preflight import check_labels, check_recipe
+from oracles.command_line import beambox
 from oracles.tiny_training import OPTIONS, frames, tiny_kitti
 
 FORKLIFT = {"name": "Forklift", "size": [3.9, 1.6, 1.5], "bottom": -1.73, "matched": 0.5, "unmatched": 0.35}
@@ -157,3 +160,24 @@ def test_recipes_that_ship_pass_and_those_of_publications_say_float32() -> None:
         for made in read_stages(entry.path):
             check_recipe(made, build(made.detector.name, made.detector.options).config, 1)
             assert made.precision == "float32" or entry.audience != "published", entry.name
+
+
+def test_data_of_ones_own_are_given_by_their_yaml_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As docs/custom_data.md has it: `beambox train recipe.yaml --data data.yaml`."""
+    root = tiny_kitti(tmp_path / "data")
+    own = tmp_path / "data" / "training" / "own.yaml"
+    (own.parent / "labels").mkdir()
+    for frame in frames(5).frames:
+        assert frame.labels is not None
+        box = {"name": "Car", "box": frame.labels.boxes[0].tolist()}
+        (own.parent / "labels" / f"{frame.id}.json").write_text(json.dumps([box]))
+    own.write_text("points: velodyne/{frame}.bin\nlabels: labels/{frame}.json\nformat: json\nclasses: [Car]\n")
+    source = {"kind": "custom", "path": "{data}", "split": "all"}
+    made = recipe(data=[source], augment=None, validation=None, optim={"iterations": 1, "batch": 2})
+    (tmp_path / "r.yaml").write_text(yaml.safe_dump(made.model_dump(mode="json")))
+    ran = beambox(capsys, "train", tmp_path / "r.yaml", "--data", own, "--out", tmp_path / "run")
+    assert ran.status == 0, ran.err
+    assert (tmp_path / "run" / "final.safetensors").is_file()
+    ran = beambox(capsys, "train", tmp_path / "r.yaml", "--data", root / "none.yaml", "--out", tmp_path / "other")
+    assert ran.status == 2
+    assert "--data: there is no file" in ran.err

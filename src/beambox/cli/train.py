@@ -32,14 +32,7 @@ def command(
 
     On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox train RECIPE --data DIR
     """
-    from beambox.train.stages import read_stages, train_stages
+    from beambox.verbs import train
 
-    stages = read_stages(recipe, change or [])
-    if data is not None and not data.exists():
-        from beambox.checks import MissingFileError
-
-        kind = "file" if data.suffix in (".yaml", ".yml") else "folder"
-        raise MissingFileError(f"--data: there is no {kind} {data}")
-    outcome = train_stages(stages, data, out or Path("runs") / stages[-1].name, resume)
-    if not outcome.finished:
+    if not train(recipe, data, out, overrides=change or [], resume=resume).finished:
         raise typer.Exit(130)
