@@ -12,6 +12,8 @@ once
     one file ``{"frames": [{"frame_id", "annos": {"names", "boxes_3d"}}]}``.
 kitti
     label_2 text; boxes in a camera frame.
+
+Labels of annotation tools are read by :mod:`beambox.data.labels`.
 """
 
 from __future__ import annotations
@@ -29,20 +31,14 @@ import torch
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.kitti_text import parse_labels
+from beambox.data import kitti_text
+from beambox.data.labels.catalogue import FORMATS, parse_labels
+from beambox.data.labels.tables import SYNONYMS
 from beambox.geometry.calibration import Calibration
 
 __all__ = ["CAMERA_AT_THE_SENSOR", "NamedBoxes", "parse_box_file", "parse_frames_file", "parse_kitti_boxes"]
 
 NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw")
-ALIASES = {
-    "name": ("name", "label", "class", "type", "category"),
-    "frame": ("frame", "frame_id", "scan", "sweep"),
-    "l": ("l", "length", "dx"),
-    "w": ("w", "width", "dy"),
-    "h": ("h", "height", "dz"),
-    "yaw": ("yaw", "heading", "theta", "rotation"),
-}
 CAMERA_AT_THE_SENSOR = Calibration(
     p2=torch.tensor([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
     r0=torch.eye(3),
@@ -68,12 +64,15 @@ def parse_box_file(text: str, kind: str, where: str) -> NamedBoxes:
 
     Args:
         text: content of the file.
-        kind: pandaset, csv or json.
+        kind: pandaset, csv or json, or a name of :data:`beambox.data.labels.catalogue.FORMATS`.
         where: what errors call the file.
 
     Raises:
         BeamboxError: naming file and line or entry.
     """
+    if kind in FORMATS:
+        found = _tool_boxes(text, kind, where)
+        return next(iter(found.values())) if found else _collect(())
     rows = {"pandaset": _pandaset_rows, "csv": _csv_rows, "json": _json_rows}[kind](text, where)
     return _collect([row[1:] for row in rows])
 
@@ -84,6 +83,8 @@ def parse_frames_file(text: str, kind: str, where: str) -> dict[str, NamedBoxes]
     Raises:
         BeamboxError: naming file and line or entry.
     """
+    if kind in FORMATS and FORMATS[kind].write_all is not None:
+        return _tool_boxes(text, kind, where)
     if kind not in ("csv", "json", "once"):
         raise BeamboxError(f"{where}: boxes in {kind} format come as one file a frame; put {{frame}} into its path")
     rows = {"csv": _csv_rows, "json": _json_rows, "once": _once_rows}[kind](text, where)
@@ -99,8 +100,14 @@ def parse_frames_file(text: str, kind: str, where: str) -> dict[str, NamedBoxes]
 
 def parse_kitti_boxes(text: str, calibration: Calibration, where: str) -> NamedBoxes:
     """Read a KITTI label file's boxes, carried into the LiDAR frame; DontCare regions are left out."""
-    labels = parse_labels(text, calibration, where)
+    labels = kitti_text.parse_labels(text, calibration, where)
     return NamedBoxes(labels.names, labels.boxes.double().numpy(), (where,) * len(labels))
+
+
+def _tool_boxes(text: str, kind: str, where: str) -> dict[str, NamedBoxes]:
+    """Read labels of an annotation tool."""
+    frames, _ = parse_labels(text, kind, where)
+    return {name: NamedBoxes(frame.names, frame.boxes, frame.places) for name, frame in frames.items()}
 
 
 Row = tuple[Any, str, Sequence[float], str]  # frame or None, name ("" for a frame without boxes), seven numbers, place
@@ -138,7 +145,7 @@ def _columns(known: Iterable[str], place: str) -> dict[str, str]:
     have = {str(name).strip().lower(): name for name in known}
     found = {}
     for wanted in ("frame", "name", *NUMBERS):
-        match = next((have[alias] for alias in ALIASES.get(wanted, (wanted,)) if alias in have), None)
+        match = next((have[alias] for alias in SYNONYMS[wanted] if alias in have), None)
         if match is not None:
             found[wanted] = match
         elif wanted != "frame":
@@ -147,7 +154,8 @@ def _columns(known: Iterable[str], place: str) -> dict[str, str]:
 
 
 def _csv_rows(text: str, where: str) -> Iterable[Row]:
-    reader = csv.DictReader(io.StringIO(text))
+    first = text.lstrip().partition("\n")[0]
+    reader = csv.DictReader(io.StringIO(text), delimiter=max(",;\t|", key=first.count))
     if reader.fieldnames is None:
         raise BeamboxError(f"{where} is empty; expected a header line with name, x, y, z, l, w, h, yaw")
     columns = _columns(reader.fieldnames, f"{where}, line 1")
