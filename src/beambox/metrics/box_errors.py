@@ -28,7 +28,7 @@ from beambox.metrics.kitti import KittiFrame
 from beambox.metrics.overlap import rotated_overlaps
 from beambox.structures.labels import Labels
 
-__all__ = ["MIN_OVERLAP", "NEAR", "box_errors", "greedy_pairs", "signed_errors"]
+__all__ = ["MIN_OVERLAP", "NEAR", "box_errors", "countable", "greedy_pairs", "signed_errors"]
 
 Floats = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def signed_errors(truth: Floats, found: Floats) -> Floats:
     return np.column_stack((*columns, away[:, 3:6], turn))
 
 
-def _countable(labels: Labels) -> NDArray[np.bool_]:
+def countable(labels: Labels) -> NDArray[np.bool_]:
     """Say which objects KITTI's hard level takes in; all where labels have no image boxes."""
     if labels.attributes is None:
         return np.ones(len(labels), dtype=np.bool_)
@@ -113,7 +113,7 @@ def _of_class(frame: KittiFrame, name: str) -> _Class:
     boxes, scores = found.boxes.detach().cpu()[theirs].double(), found.scores.detach().cpu()[theirs].double()
     order = torch.argsort(scores, descending=True, stable=True)
     return _Class(
-        labels.boxes.double().numpy()[mine], _countable(labels)[mine], boxes[order].numpy(), scores[order].numpy()
+        labels.boxes.double().numpy()[mine], countable(labels)[mine], boxes[order].numpy(), scores[order].numpy()
     )
 
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 
+from beambox.checks import printable
 from beambox.structures import Detections, Frame, Labels
 from beambox.visualise.colours import TRUTH, Colour, class_colour, gradient
 
 __all__ = ["viewer_html"]
 
+MARK = re.compile(r"\{\{(TITLE|DATA)\}\}")
 REACH = 327.0
 """Metres that whole centimetres in 16 bits can hold; points farther away are left out."""
 
@@ -43,9 +46,10 @@ def viewer_html(
         "boxes": _boxes(detections, labels),
         "legend": _legend(detections, labels),
     }
-    data = json.dumps(content, separators=(",", ":")).replace("</", "<\\/")  # a name must not end the script
+    data = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")  # neither a tag nor a comment may begin
     page = Path(__file__).with_name("viewer.html").read_text(encoding="utf-8")
-    return page.replace("{{TITLE}}", html.escape(name)).replace("{{DATA}}", data)
+    put_in = {"TITLE": html.escape(printable(name, 500)), "DATA": data}
+    return MARK.sub(lambda mark: put_in[mark[1]], page)  # in one pass: what is put in is not looked through again
 
 
 def _packed(array: np.ndarray) -> str:

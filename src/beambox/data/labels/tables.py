@@ -21,8 +21,19 @@ __all__ = ["format_csv", "format_pandaset", "format_text", "parse_csv", "parse_p
 
 NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw")
 SYNONYMS = {
-    "name": ("name", "label", "class", "class_name", "classname", "type", "category", "category_name", "obj_type"),
-    "frame": ("frame", "frame_id", "frameid", "scan", "sweep", "sample", "file", "filename", "timestamp"),
+    "name": (
+        "name",
+        "label",
+        "class",
+        "class_name",
+        "classname",
+        "type",
+        "category",
+        "category_name",
+        "obj_type",
+        "object_type",
+    ),
+    "frame": ("frame", "frame_id", "frame_name", "frameid", "scan", "sweep", "sample", "file", "filename", "timestamp"),
     "id": ("id", "track_id", "trackid", "object_id", "obj_id", "instance_id", "instance", "uuid", "track"),
     "x": ("x", "cx", "center_x", "centre_x", "x_center", "position.x", "position_x", "pos_x", "px", "tx"),
     "y": ("y", "cy", "center_y", "centre_y", "y_center", "position.y", "position_y", "pos_y", "py", "ty"),
@@ -30,9 +41,30 @@ SYNONYMS = {
     "l": ("l", "length", "dx", "size_x", "length_m", "len", "scale_x", "dim_x"),
     "w": ("w", "width", "dy", "size_y", "width_m", "wid", "scale_y", "dim_y"),
     "h": ("h", "height", "dz", "size_z", "height_m", "scale_z", "dim_z"),
-    "yaw": ("yaw", "heading", "theta", "rotation", "rotation_z", "rot_z", "rz", "orientation", "angle", "yaw_rad"),
+    "yaw": (
+        "yaw",
+        "heading",
+        "theta",
+        "rotation",
+        "rotation_z",
+        "rot_z",
+        "rz",
+        "orientation",
+        "angle",
+        "yaw_rad",
+        "heading_rad",
+    ),
 }
-DEGREES = ("yaw_deg", "yaw_degrees", "heading_deg", "heading_degrees", "angle_deg")
+DEGREES = (
+    "yaw_deg",
+    "yaw_degrees",
+    "heading_deg",
+    "heading_degrees",
+    "rotation_deg",
+    "angle_deg",
+    "yaw(deg)",
+    "yaw (deg)",
+)
 PANDASET = ("position.x", "position.y", "position.z", "dimensions.y", "dimensions.x", "dimensions.z", "yaw")
 """PandaSet's columns in the order x, y, z, l, w, h, yaw."""
 

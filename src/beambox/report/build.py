@@ -1,0 +1,190 @@
+"""From what a user names (weights or a folder of results, and data) to a measured evaluation and its page."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from beambox import __version__
+from beambox.checks import BeamboxError, MissingFileError
+from beambox.data.custom import CustomSource
+from beambox.data.custom_config import KITTI_GROUND
+from beambox.data.once import OnceSource
+from beambox.data.source import FrameSource
+from beambox.infer.benchmark import device_name
+from beambox.infer.cards import read_card
+from beambox.infer.evaluate import detect_frames, scored_frames
+from beambox.infer.predictor import View, find_weights, load
+from beambox.infer.results import find_result, read_result
+from beambox.io import read_text, write_text
+from beambox.report.failures import Picture, draw_failures, worst
+from beambox.report.measure import Measured, PointCounts, TimedDetect, measure
+from beambox.report.page import report_html
+from beambox.report.tables import write_numbers
+from beambox.structures import Detections, Frame
+
+__all__ = ["Options", "base_source", "is_results", "measured", "write_page"]
+
+RECIPE_NAMES = ("recipe.yaml", "config.yaml")
+"""What a run's folder calls the recipe it was trained by."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to detect and score."""
+
+    data: Path
+    split: str = "val"
+    classes: tuple[str, ...] = ()
+    """To score; the detector's where empty."""
+    levels: bool = True
+    """False: without KITTI's levels."""
+    range: float | list[float] | None = None
+    view: str = "auto"
+    batch: int = 1
+    device: str = "auto"
+    precision: str = "auto"
+
+
+def base_source(source: FrameSource) -> FrameSource:
+    """Return the data set behind a part of it."""
+    while hasattr(source, "source"):
+        source = source.source  # pyright: ignore[reportAttributeAccessIssue]
+    return source
+
+
+def is_results(given: str) -> bool:
+    """Tell a folder of results from weights: a folder without a weight file."""
+    path = Path(given)
+    return path.is_dir() and not any(path.glob("*.safetensors"))
+
+
+def measured(given: str, source: FrameSource, options: Options) -> Measured:
+    """Detect, or read results, and measure.
+
+    Raises:
+        BeamboxError: if there are no such weights or results, or the data have no labels.
+    """
+    counts = PointCounts()
+    about: dict[str, Any] = {
+        "data": options.data.name,
+        "split": options.split,
+        "beambox": __version__,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    if is_results(given):
+        found = _read_results(Path(given), source)
+        frames = scored_frames(counts.watch(found))
+        known = dict.fromkeys(name for frame in frames for name in frame.detections.classes)
+        classes, about = tuple(known), {"results": Path(given).name, **about}
+    else:
+        detect, classes, more = _detector(given, source, options)
+        frames = scored_frames(counts.watch(detect_frames(detect, source, batch=options.batch)))
+        about = {**more, **about}
+        if detect.summary():
+            about["latency, ms per frame"] = detect.summary()
+    classes = options.classes or classes
+    if not classes:
+        raise BeamboxError(f"{given} holds no detection, so the classes to score are not known; give --classes")
+    by_once = isinstance(base_source(source), OnceSource)
+    return measure(
+        Path(given).stem,
+        frames,
+        classes,
+        by_once=by_once,
+        levels=options.levels,
+        points=counts.counts,
+        about=about,
+    )
+
+
+def _detector(given: str, source: FrameSource, options: Options) -> tuple[TimedDetect, tuple[str, ...], dict[str, Any]]:
+    base, region, height = base_source(source), options.range, None
+    if isinstance(base, CustomSource):
+        region = region or base.config.range
+        height = None if base.config.sensor_height is None else -KITTI_GROUND
+    view: View = options.view  # pyright: ignore[reportAssignmentType]  # load checks it
+    detector = load(
+        given, device=options.device, precision=options.precision, view=view, range=region, sensor_height=height
+    )
+    path = find_weights(given)
+    card = read_card(path)
+    about: dict[str, Any] = {
+        "detector": card.detector,
+        "weights": f"{path.name}, sha256 {card.sha256}",
+        "device": device_name(detector.device),
+        "precision": str(detector.dtype).removeprefix("torch."),
+        "frames in one pass": options.batch,
+        "card": dict(card.said),
+    }
+    recipe = next((path.parent / name for name in RECIPE_NAMES if (path.parent / name).is_file()), None)
+    if recipe is not None:
+        about["recipe"] = {recipe.name: read_text(recipe)}
+    return TimedDetect(detector.detect), tuple(detector.classes), about
+
+
+def _read_results(folder: Path, source: FrameSource) -> Iterator[tuple[Frame, Detections]]:
+    names = list(source.ids)
+    missing = [name for name in names if find_result(folder, name) is None]
+    if missing:
+        raise MissingFileError(
+            f"{len(missing)} of {len(names)} frames have no results in {folder}, the first is {missing[0]} "
+            "(.json, .csv or .txt); write an empty file where nothing was found"
+        )
+    for index, name in enumerate(names):
+        path = find_result(folder, name)
+        assert path is not None
+        frame = source[index]
+        yield frame, read_result(path, frame)
+
+
+def write_page(
+    out: Path,
+    all_of: Sequence[Measured],
+    source: FrameSource,
+    most: int = 6,
+    pages: bool = False,
+    numbers: Sequence[Path] = (),
+) -> None:
+    """Write the report, the numbers, and where asked a 3-D page of each frame that it shows.
+
+    Args:
+        out: the page; frames go into the folder ``<stem>_frames`` beside it.
+        all_of: one or two evaluations.
+        source: of their frames.
+        most: pictures of each kind of failure and class.
+        pages: write 3-D pages.
+        numbers: further files, by their endings.
+    """
+    first = all_of[0]
+    failures = {name: worst(first.matches, name, most) for name in first.classes}
+    drawn = list(draw_failures(first, source, [one for some in failures.values() for one in some]))
+    pictures: dict[str, list[Picture]] = {name: [] for name in first.classes}
+    for picture in drawn:
+        pictures[picture.failure.name].append(picture)
+    links = _frame_pages(out, first, source, drawn) if pages else {}
+    write_text(out, report_html(all_of, pictures, links=links))
+    for path in numbers:
+        write_numbers(path, all_of)
+
+
+def _frame_pages(out: Path, one: Measured, source: FrameSource, drawn: Sequence[Picture]) -> Mapping[str, str]:
+    from urllib.parse import quote
+
+    from beambox.visualise.scene import Scene, scene_html
+
+    folder = out.with_name(f"{out.stem}_frames")
+    links = {}
+    for number in sorted({picture.failure.frame for picture in drawn}):
+        frame = source[number]
+        name = f"{frame.id.replace('/', '_')}.html"
+        scene = Scene(frame, one.frames[number].detections, one.frames[number].labels)
+        write_text(folder / name, scene_html([scene], title=f"{frame.id}, {one.name}"))
+        links[frame.id] = f"{quote(folder.name)}/{quote(name)}"
+    return links
