@@ -88,7 +88,7 @@ class _Calls(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = getattr(func, "__name__", "")
-        if name in SENT:
+        if (name in SENT and not isinstance(args[0], Tensor | type(None))) or name == "new_tensor":
             self.launches.sent[name] += 1
         out = func(*args, **(kwargs or {}))
         if name in TAKEN_HOME:
