@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "train": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "infer"},
     "report": {"infer", "data", "metrics", "visualise", "structures", "geometry", "ops"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
+    "stream": {"track", "infer", "data", "structures", "geometry"},
     "track": {"infer", "data", "metrics", "structures", "geometry", "ops"},
     "zoo": set(),
 }

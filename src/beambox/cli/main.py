@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
+    "stream": ("beambox.cli.stream:command", "detect and track through a recording; boxes as a recording"),
     "track": ("beambox.cli.track:command", "follow objects through a drive: identities, velocities"),
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
