@@ -84,7 +84,8 @@ def test_show_turns_other_axes_forward_up(capsys: Capture, weights: Path, scan: 
     [
         (("--colour", "hight"), 'unknown colour "hight" (did you mean "height"?)'),
         (("--results", "nowhere"), "nowhere is not a folder of results"),
-        (("--out", "a.gif"), "a picture is written as .png, .jpg or .html"),
+        (("--out", "a.tif"), "a picture is written as .png, .jpg or .html, a film as .gif, .webp, .mp4"),
+        (("--out", "a.gif", "--rate", "0"), "--rate must be more than 0"),
         (("--labels", "there"), "they need the calibration of scan"),
         (("--area", "1,2"), "--area takes one number, or four"),
     ],

@@ -29,7 +29,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
-    "report": ("beambox.cli.report:command", "one page per evaluation: curves, errors, groups, worst failures as pictures"),
+    "report": ("beambox.cli.report:command", "one page per evaluation: curves, errors, worst failures as pictures"),
     "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
     "data": ("beambox.cli.data:app", "check a data set of one's own before training, and propose anchors for it"),
     "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),

@@ -52,9 +52,9 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
 
     A folder of results holds one file per frame: .json or .csv of `beambox detect`, or KITTI's .txt.
     """
-    from beambox.report.build import Options, measured, write_page
     from beambox.data.opening import open_data
     from beambox.data.source import SubsetSource
+    from beambox.report.build import Options, measured, write_page
     from beambox.report.tables import check_ending
 
     if out.suffix.lower() not in (".html", ".htm"):

@@ -94,7 +94,7 @@ def _scores(all_of: Sequence[Measured]) -> str:
     kitti = isinstance(first.scored, KittiResult)
     notes = first.scored.table().splitlines()[: 3 if kitti else 2]
     parts = ["<h2>Average precision</h2><p>", "<br>".join(escape(line) for line in notes), "</p>"]
-    if not kitti or len(first.scored.levels) > 1:
+    if not isinstance(first.scored, KittiResult) or len(first.scored.levels) > 1:
         parts.append("<p>On grey, in bold: the number that papers quote.</p>")
     if kitti and _capped(first):
         parts.append(f"<p>{escape(_capped(first))}</p>")

@@ -13,8 +13,7 @@ from beambox import __version__
 from beambox.checks import BeamboxError
 from beambox.io import write_json, write_text
 from beambox.metrics.box_errors_result import COLUMNS
-from beambox.metrics.once_result import BANDS
-from beambox.metrics.once_result import OnceResult
+from beambox.metrics.once_result import BANDS, OnceResult
 from beambox.report import numbers
 from beambox.report.measure import Measured
 
