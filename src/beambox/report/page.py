@@ -43,7 +43,8 @@ def report_html(
     for each in first.classes:
         shown = (pictures or {}).get(each, ())
         parts.append(f'<section data-class="{escape(each)}">')
-        parts += [*_class(all_of, each), *_pictures(shown, links or {}), "</section>"]
+        parts += [*_class([one for one in all_of if each in one.classes], each), *_pictures(shown, links or {})]
+        parts.append("</section>")
     parts += [_confusion(all_of), *(_about(one) for one in all_of)]
     page = Path(__file__).with_name("report.html").read_text(encoding="utf-8")
     return fill(page, {"TITLE": escape(name), "CONTENT": "\n".join(parts)})
