@@ -1,4 +1,4 @@
-"""Detectors on the device against the CPU with the same weights: predictions, losses, gradients, detections; and tests."""
+"""Detectors on the device against the CPU with the same weights: outputs, losses, gradients, detections; and tests."""
 
 from __future__ import annotations
 

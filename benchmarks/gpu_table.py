@@ -50,15 +50,17 @@ def correctness(report: Report) -> list[str]:
 def speed(report: Report) -> list[str]:
     """Latency, share of the peaks, launches and waits."""
     best = items(report, "peaks")
-    rate = best.get("bfloat16", {}).get("tflops") if report["device"] == "cuda" else best.get("float32", {}).get("tflops")
+    rate = (
+        best.get("bfloat16", {}).get("tflops") if report["device"] == "cuda" else best.get("float32", {}).get("tflops")
+    )
     copy = best.get("copy", {}).get("gbps")
     lines = [
-        f"{'points to boxes, ms':14} {'batch 1':>9} {'batch 8':>9} {'float32':>9} {'GFLOP':>8} {'GB':>7} {'of peak':>8} "
-        f"{'of copy':>8} {'launches':>9} {'waits':>6} {'kernels':>8} {'MB':>7}"
+        f"{'points to boxes, ms':14} {'batch 1':>9} {'batch 8':>9} {'float32':>9} {'GFLOP':>8} {'GB':>7} "
+        f"{'of peak':>8} {'of copy':>8} {'launches':>9} {'waits':>6} {'kernels':>8} {'MB':>7}"
     ]
     for name in DETECTORS:
         told = items(report, f"latency:{name}")
-        main = "bfloat16" if f"bfloat16 batch 1" in told else "float32"
+        main = "bfloat16" if "bfloat16 batch 1" in told else "float32"
         one, eight, plain = (told.get(k, {}) for k in (f"{main} batch 1", f"{main} batch 8", "float32 batch 1"))
         work, launches, waits = (told.get(k, {}) for k in ("work, batch 1", "launches, batch 1", "waits, batch 1"))
         ms = one.get("ms")
@@ -104,6 +106,8 @@ def faults(report: Report) -> list[str]:
             if "error" in told:
                 lines.append(f"FAILED {name}: {item}: {told['error']}")
             elif told.get("ok") is False:
-                shown = {k: told[k] for k in ("worst", "limit", "wrong", "of", "count", "matched", "failed") if k in told}
+                shown = {
+                    k: told[k] for k in ("worst", "limit", "wrong", "of", "count", "matched", "failed") if k in told
+                }
                 lines.append(f"FAILED {name}: {item}: {shown}")
     return ["", *lines] if lines else ["", "nothing failed"]

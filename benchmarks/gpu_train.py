@@ -304,7 +304,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=max(1, min(14, (os.cpu_count() or 2) - 2)))
     parser.add_argument("--save-every", type=float, default=90.0, help="seconds")
     parser.add_argument("--validate", action="store_true", help="keep the recipe's validation")
-    parser.add_argument("--measure-data", type=float, metavar="SECONDS", help="only measure how fast one core prepares data")
+    parser.add_argument(
+        "--measure-data", type=float, metavar="SECONDS", help="only measure how fast one core prepares data"
+    )
     parser.add_argument("--set", action="append", dest="change", help="change a value of the recipe: optim.lr=0.001")
     arguments = parser.parse_args()
     arguments.began = began

@@ -123,7 +123,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)
-    parser.add_argument("--split", nargs="+", default=["train"], help="lists in ImageSets/; pack no split that is for testing")
+    parser.add_argument(
+        "--split", nargs="+", default=["train"], help="lists in ImageSets/; pack no split that is for testing"
+    )
     parser.add_argument("--unpack", action="store_true")
     arguments = parser.parse_args()
     if arguments.unpack:

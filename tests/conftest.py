@@ -1,9 +1,5 @@
 """Settings of all tests."""
 
-import os
-
-os.environ.setdefault("MPLBACKEND", "Agg")
-
 import pytest
 import torch
 from hypothesis import HealthCheck, settings

@@ -13,14 +13,23 @@ PUBLIC = (
     "Batch",
     "BeamboxError",
     "Calibration",
+    "Detection",
     "Detections",
     "Detector",
     "Frame",
     "KittiSource",
+    "Label",
     "Labels",
     "VoxelGrid",
+    "draw",
+    "evaluate",
+    "export",
     "load",
+    "open_dataset",
     "read_frame",
+    "recipes",
+    "simulate",
+    "train",
 )
 
 

@@ -211,3 +211,30 @@ def test_no_module_writes_past_the_one_writer() -> None:
         if path.name != "io.py" and mark in path.read_text(encoding="utf-8")
     ]
     assert not found
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Car",
+        "my car",
+        "",
+        "#1",
+        "DontCare",
+        "dontcare",
+        "50% off",
+        "a%20b",
+        "%",
+        "%00",
+        "Straße",
+        "汽车",
+        "a\tb\n",
+        "\x1b[31m",
+        " x ",
+    ],
+)
+def test_names_of_classes_survive_text_files(name: str) -> None:
+    word = io.name_to_word(name)
+    assert word.split() == [word] and word.isprintable() and not word.startswith("#") and word.lower() != "dontcare"
+    assert io.word_to_name(word) == name
+    assert io.name_to_word("Car") == "Car" and io.word_to_name("100%ABC") == "100%ABC"

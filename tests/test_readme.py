@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-import shlex
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -11,25 +11,17 @@ import pytest
 import typer
 
 from beambox.cli.main import COMMANDS
+from beambox.train.recipes import find_recipe, list_recipes
+from beambox.train.tables import TABLES
+from beambox.zoo import shipped
+from oracles import pages
 from oracles.command_line import beambox
 from oracles.paths import ROOT
 from oracles.tiny_detector import street, tiny_weights
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUN = ("detect", "show", "doctor", "models")
-
-
-def blocks(page: Path, language: str) -> list[str]:
-    """Return the fenced blocks of a language ("" for none)."""
-    parts = re.split(r"(?m)^```(\w*)$", page.read_text(encoding="utf-8"))  # text, fence, inside, fence, text, ...
-    return [inside for fence, inside in zip(parts[1::4], parts[2::4]) if fence == language]
-
-
-def commands(page: Path) -> list[list[str]]:
-    """Return the words of every `beambox ...` line in a page's blocks."""
-    text = "\n".join(block for language in ("", "sh", "bash", "console") for block in blocks(page, language))
-    lines = [line.strip().removeprefix("$ ") for line in text.replace("\\\n", " ").splitlines()]
-    return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("beambox ")]
+TO_RUN = re.compile(r"^(run\d*|real|sim|M|\S*\.(safetensors|yaml))$|/")  # what a reader trained; a path
+NAME = re.compile(r"\b(?:pointpillars|second|voxel_rcnn|hcnet|kassd|dennet)-[a-z0-9_-]*[a-z0-9]\b")
 
 
 def options_of(name: str) -> set[str]:
@@ -47,23 +39,46 @@ def options_of(name: str) -> set[str]:
     return known
 
 
-ALL = sorted({(page.name, tuple(words)) for page in PAGES if page.exists() for words in commands(page)})
+COMMAND_LINES = sorted(
+    {(block.page, tuple(words[1:])) for block in pages.ALL for words in block.commands if words[0].endswith("beambox")}
+)
 
 
 def test_the_documents_hold_commands() -> None:
-    assert len(ALL) > 4
+    assert len(COMMAND_LINES) > 50
 
 
 @pytest.mark.parametrize(
-    ("page", "words"), ALL, ids=lambda value: " ".join(value)[:60] if isinstance(value, tuple) else ""
+    ("page", "words"), COMMAND_LINES, ids=lambda value: " ".join(value)[:60] if isinstance(value, tuple) else ""
 )
-def test_commands_and_options_that_pages_name_exist(page: str, words: tuple[str, ...]) -> None:
+def test_commands_options_and_names_that_pages_use_exist(page: str, words: tuple[str, ...]) -> None:
     if words[0] in ("--help", "--version"):
         return
-    if words[0] not in COMMANDS:
-        pytest.skip(f"{words[0]} has not landed yet")
+    assert words[0] in COMMANDS, f"{page}: there is no command {words[0]}"
     used = {word.split("=")[0] for word in words[1:] if re.match(r"--?[a-z]", word)}
     assert used <= options_of(words[0]), f"{page}: {' '.join(words)}"
+    given = dict(itertools.pairwise(words))
+    model = given.get("--model") or given.get("-m") or (words[1] if words[0] in ("evaluate", "export", "bench") else "")
+    assert not model or model in shipped() or TO_RUN.search(model), f"{page}: no weights are called {model}"
+    recipe = given.get("--recipe") or (words[1] if words[0] == "train" else "")
+    if recipe and not TO_RUN.search(recipe):
+        assert find_recipe(recipe).stem == recipe
+    if words[0] == "ablate":
+        assert words[1] in TABLES
+
+
+@pytest.mark.parametrize("page", pages.PAGES, ids=lambda page: page.name)
+def test_names_of_weights_recipes_and_tables_in_the_text_exist(page: Path) -> None:
+    known = {*shipped(), *TABLES, *(one.name for one in list_recipes())}
+    quoted = re.findall(r"`([^`\n]+)`", page.read_text(encoding="utf-8"))
+    named = {name for text in quoted for name in NAME.findall(text)}
+    assert named <= known
+
+
+@pytest.mark.parametrize("block", [b for b in pages.ALL if b.commands], ids=lambda b: f"{b.page}: {b.text[:40]}")
+def test_a_block_of_commands_runs_or_says_why_not(block: pages.Block) -> None:
+    """tests/test_wheel.py runs those without a mark, tests/cli/test_own_data.py those marked "run"."""
+    assert block.mark in ("", "run") or len(block.why_not.split()) > 2, block.mark
 
 
 @pytest.fixture
@@ -88,14 +103,14 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("page", ["README.md", "docs/detect.md", "docs/pictures.md"])
 def test_python_of_the_documents_runs(desk: Path, capsys: pytest.CaptureFixture[str], page: str) -> None:
-    found = blocks(ROOT / page, "python")
+    found = [block for block in pages.blocks(ROOT / page) if block.language == "python"]
     assert found
     for block in found:
-        exec(compile(block, page, "exec"), {})
+        exec(compile(block.text, page, "exec"), {})
     assert "Car" in capsys.readouterr().out or (desk / "scan.png").exists(), "the examples print or draw something"
 
 
-README_COMMANDS = [words for words in commands(ROOT / "README.md") if words[0] in RUN and words[0] in COMMANDS]
+README_COMMANDS = [list(words) for page, words in COMMAND_LINES if page == "README.md" and words[0] in RUN]
 
 
 @pytest.mark.parametrize("words", README_COMMANDS, ids=" ".join)

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import fields
+from enum import Enum
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 if TYPE_CHECKING:  # the command line imports this module before it knows whether torch is needed
     import torch
@@ -17,12 +19,21 @@ if TYPE_CHECKING:  # the command line imports this module before it knows whethe
 __all__ = [
     "BeamboxError",
     "MissingFileError",
+    "choose_fields",
+    "chosen",
     "did_you_mean",
     "expect_dtype",
     "expect_finite",
+    "expect_one_of",
     "expect_same_length",
     "expect_shape",
+    "how_to_install",
+    "printable",
 ]
+
+
+LONGEST_WORD = 200
+"""No name is looked up by likeness that has more letters: it is no typing error, and comparing takes long."""
 
 
 class BeamboxError(ValueError):
@@ -77,10 +88,82 @@ def expect_same_length(**lengths: int) -> None:
         raise BeamboxError(f"these must have the same length: {told}")
 
 
+E = TypeVar("E", bound=Enum)
+
+
+def chosen(name: str, value: object, options: type[E]) -> E:
+    """Return the member of an enumeration that a value is, or whose value it is.
+
+    Args:
+        name: what the option is called in the message.
+        value: a member, or its value, such as ``"sigmoid"``.
+        options: the enumeration.
+
+    Raises:
+        BeamboxError: for anything else, naming the nearest.
+    """
+    if isinstance(value, options):
+        return value
+    words = [str(option.value) for option in options]
+    if isinstance(value, str) and value in words:
+        return options(value)
+    raise _no_option(name, value, words)
+
+
+def expect_one_of(name: str, value: object, options: Sequence[str]) -> None:
+    """Check that a word is one of those an option knows."""
+    if value not in options:
+        raise _no_option(name, value, options)
+
+
+def _no_option(name: str, value: object, words: Sequence[str]) -> BeamboxError:
+    hint = did_you_mean(value, words) if isinstance(value, str) else f" (known: {', '.join(sorted(words))})"
+    return BeamboxError(f"`{name}` must be one of its options, got {value!r}{hint}")
+
+
+def choose_fields(settings: Any) -> None:
+    """Turn the words in a frozen dataclass's enumeration fields into members; to be called in ``__post_init__``.
+
+    Raises:
+        BeamboxError: for a word that the field's enumeration does not know.
+    """
+    hints = get_type_hints(type(settings))
+    for field in fields(settings):
+        kind = hints[field.name]
+        if isinstance(kind, type) and issubclass(kind, Enum):
+            object.__setattr__(settings, field.name, chosen(field.name, getattr(settings, field.name), kind))
+
+
 def did_you_mean(word: str, options: Iterable[str]) -> str:
     """Return `` (did you mean "x"?)`` for the nearest option, or the list of options where none is near."""
-    known = sorted(options)
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    known = sorted(str(option)[:LONGEST_WORD] for option in options)
+    near = [] if len(word) > LONGEST_WORD else difflib.get_close_matches(word, known[:1000], n=1, cutoff=0.6)
     if near:
         return f' (did you mean "{near[0]}"?)'
-    return f" (known: {', '.join(known)})" if known else ""
+    more = f" and {len(known) - 40} more" if len(known) > 40 else ""
+    return f" (known: {', '.join(known[:40])}{more})" if known else ""
+
+
+def printable(text: str, limit: int | None = None) -> str:
+    r"""Return text that a terminal and a picture can show: what would steer a terminal is written as an escape.
+
+    Names and messages come from files, and ``\x1b[2J`` in one of them would otherwise clear the screen.
+
+    Args:
+        text: anything.
+        limit: longest result in characters; the middle of longer texts is left out, and their length said.
+    """
+    if limit is not None and len(text) > limit:
+        half = max(1, limit // 2 - 20)
+        text = f"{text[:half]} ... ({len(text):,} characters) ... {text[-half:]}"
+    if text.replace("\n", "").replace("\t", "").isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() or letter in "\n\t" else letter.encode("unicode_escape").decode()
+        for letter in text
+    )
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra of beambox, which no index holds: from its checkout."""
+    return f'python -m pip install ".[{extra}]" in the checkout of beambox'

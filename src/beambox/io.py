@@ -24,6 +24,7 @@ from beambox.checks import BeamboxError, MissingFileError
 
 __all__ = [
     "check_file_name",
+    "name_to_word",
     "parse_json",
     "parse_yaml",
     "read_bytes",
@@ -32,6 +33,7 @@ __all__ = [
     "read_text",
     "read_yaml",
     "replacing",
+    "word_to_name",
     "write_bytes",
     "write_json",
     "write_text",
@@ -45,6 +47,7 @@ MOST_NODES = 100_000
 """Values that a YAML file may stand for once its aliases are written out."""
 LONGEST_NAME = 200
 """Bytes of a name; file systems take 255, and endings are added."""
+PLAIN_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,190}")  # what nearly all names are, told quickly
 ABANDONED = 86_400
 """A draft whose writer cannot be asked after is left over once it is older than this many seconds."""
 DRAFT = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<pid>[0-9]+)-[0-9a-f]{8}\.part")
@@ -225,6 +228,8 @@ def check_file_name(name: object, where: str) -> str:
     Raises:
         BeamboxError: if it is empty, no text, ``.`` or ``..``, too long, or holds a separator or a control character.
     """
+    if isinstance(name, str) and PLAIN_NAME.fullmatch(name):
+        return name
     if not isinstance(name, str):
         raise BeamboxError(f"{where}: a name must be text, got {type(name).__name__}")
     fault = None
@@ -240,6 +245,41 @@ def check_file_name(name: object, where: str) -> str:
         shown = name if len(name) <= 60 else name[:60] + "..."
         raise BeamboxError(f'{where}: a name must be a plain file name such as "000123", but {shown!a} {fault}')
     return name
+
+
+def name_to_word(name: str, reserved: str = "DontCare") -> str:
+    """Write the name of a class as one word of a text file whose columns are parted by blanks.
+
+    Blanks, control characters and what would make the word another thing are written as ``%20`` and the like;
+    :func:`word_to_name` reads them back.
+
+    Args:
+        name: any text.
+        reserved: a word, in any case, that means something else in the file.
+    """
+    if not name or name.lower() == reserved.lower() or name.startswith("#"):
+        return "%" + (f"{ord(name[0]):02x}{_escaped(name[1:])}" if name else "00")
+    return _escaped(name)
+
+
+def _escaped(name: str) -> str:
+    plain = lambda letter: letter.isprintable() and not letter.isspace() and letter != "%"
+    return "".join(
+        letter if plain(letter) else "".join(f"%{byte:02x}" for byte in letter.encode("utf-8", "replace"))
+        for letter in name
+    )
+
+
+def word_to_name(word: str) -> str:
+    """Return the name that :func:`name_to_word` wrote; a ``%`` that begins no such code stands for itself."""
+    if "%" not in word:
+        return word
+    if word == "%00":
+        return ""
+    coded = re.sub(
+        r"((?:%[0-9a-f]{2})+)", lambda m: bytes.fromhex(m[1].replace("%", "")).decode("utf-8", "replace"), word
+    )
+    return coded if name_to_word(coded) == word else word
 
 
 def read_names(path: Path, remedy: str = "") -> list[str]:

@@ -18,7 +18,8 @@ import torch
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.box_files import CAMERA_AT_THE_SENSOR
 from beambox.data.custom import CustomSource
-from beambox.data.kitti_text import format_calibration, format_labels
+from beambox.data.kitti_calibration import format_calibration
+from beambox.data.kitti_text import format_labels
 from beambox.data.opening import open_data
 from beambox.data.source import FrameSource
 from beambox.structures import Labels
@@ -204,7 +205,7 @@ def test_descriptions_that_are_wrong(folder: tuple[Path, str], keys: dict[str, s
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("Car 1 2 3", r"00\.txt, line 1: expected label x y z l w h yaw, got 4 columns"),
+        ("Car 1 2 3", r"00\.txt, line 1: expected `class x y z l w h yaw`, got 4 columns"),
         ("Car 1 2 3 4 5 6 left", r"00\.txt, line 1: expected numbers x y z l w h yaw"),
         ("Car 1 2 3 4 -5 6 0", r"00\.txt, line 1: expected finite numbers and sizes"),
         ("Car 1 2 nan 4 5 6 0", r"00\.txt, line 1: expected finite numbers and sizes"),

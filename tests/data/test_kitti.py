@@ -169,7 +169,7 @@ def test_no_text_makes_a_parser_fail_otherwise(noise: str, place: int, letters: 
 def test_results_become_detections() -> None:
     line = CAR.strip() + " 0.75\n"
     found = parse_results(line, CALIB, ("Pedestrian", "Car"), frame_id="000001")
-    assert found.names == ["Car"] and found.scores.tolist() == [0.75] and found.labels.tolist() == [1]
+    assert found.names == ["Car"] and found.scores.tolist() == [0.75] and found.class_ids.tolist() == [1]
     with pytest.raises(BeamboxError, match="expected 16 columns, got 15"):
         parse_results(CAR, CALIB)
     with pytest.raises(BeamboxError, match=r'unknown class "Car" \(did you mean "Cat"\?\)'):
@@ -241,7 +241,10 @@ def test_points_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> N
     broken.points[9, 3] = float("inf")
     write_kitti_frame(tmp_path, broken)
     read = KittiSource(tmp_path, "all")[0]
-    assert len(read) == 48 and read.notes == ("dropped 2 of 50 points that are NaN or infinite",)
+    assert len(read) == 49 and read.notes == (
+        "clipped 1 of 50 intensities to [0, 1]",
+        "dropped 1 of 50 points that are NaN or infinite",
+    )
 
 
 def test_the_image_size_comes_from_the_png_header(tmp_path: Path) -> None:

@@ -99,16 +99,18 @@ def test_once_repeated_frame_names_are_told_apart(root: Path) -> None:
     assert source[1].id == "000002_100" and len(source[1]) == 50
 
 
-def test_once_intensity_is_left_as_it_is_and_said(root: Path) -> None:
+def test_once_intensity_follows_the_one_rule_unless_asked(root: Path) -> None:
     path = root / "data" / "000002" / "lidar_roof" / "200.bin"
     points = np.fromfile(path, dtype="<f4").reshape(-1, 4)
     points[:, 3] *= 200
     points[0, 0] = np.nan
     points.tofile(path)
     read = OnceSource(root, "val")[1]
-    assert len(read) == 49 and read.points[:, 3].max() > 1
+    assert len(read) == 49 and read.points[:, 3].max() <= 1 and "intensity divided by 255" in read.notes
+    raw = OnceSource(root, "val", intensity_scale=1)[1]
+    assert raw.points[:, 3].max() > 1
     assert any("dropped 1 of 50 points" in note for note in read.notes)
-    assert any("intensities lie outside [0, 1]" in note for note in read.notes)
+    assert any("intensities lie outside [0, 1]" in note for note in raw.notes)
     assert OnceSource(root, "val", intensity_scale=1 / 255)[1].points[:, 3].max() <= 1
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.formats.columns import library
-from beambox.data.reading import SUFFIXES, points_from_array, read_frame, read_points
+from beambox.data.reading import SUFFIXES, points_from_array, read_frame, read_points, read_shifted
 from oracles.paths import data_dir
 
 RNG = np.random.default_rng(5)
@@ -38,6 +38,7 @@ def write_las(path: Path, cloud: np.ndarray, top: int = 65535) -> None:
     laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=0, version="1.2")
     header.scales = [0.001] * 3
+    header.offsets = cloud[:, :3].astype(np.int64).min(axis=0) if len(cloud) else [0] * 3
     las = laspy.LasData(header)
     las.x, las.y, las.z = cloud[:, 0], cloud[:, 1], cloud[:, 2]
     las.intensity = np.round(cloud[:, 3] * top).astype(np.uint16)
@@ -172,13 +173,21 @@ def test_points_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> N
     cloud = CLOUD.copy()
     cloud[3, 2], cloud[5, 3], cloud[9, 0] = np.nan, np.nan, -np.inf
     frame = read_frame(write(tmp_path / "a.bin", cloud))
-    assert len(frame) == 37 and frame.notes == ("dropped 3 of 40 points that are NaN or infinite",)
+    assert len(frame) == 38 and frame.notes == (
+        "1 of 40 values of intensity are NaN or infinite: set to 0",
+        "dropped 2 of 40 points that are NaN or infinite",
+    )
 
 
-def test_points_in_map_coordinates_are_said(tmp_path: Path) -> None:
+def test_map_coordinates_are_shifted_before_float32_rounds_them(tmp_path: Path) -> None:
     path = tmp_path / "a.las"
-    write_las(path, CLOUD + np.array([4.5e5, 5.4e5, 0, 0]))
-    assert "the points lie far from the origin" in read_frame(path).notes[-1]
+    write_las(path, CLOUD + np.array([4.5e5, 5.4e6, 0, 0]))
+    frame, shift = read_shifted(path)
+    assert "map coordinates: 450033 was taken from x" in frame.notes[-1]
+    back = frame.points[:, :2].double().numpy() + shift - np.array([4.5e5, 5.4e6])
+    np.testing.assert_allclose(back, CLOUD[:, :2], atol=6e-4)  # float32 alone would leave 0.5 m
+    far = CLOUD + np.array([4.5e5, 5.4e6, 0, 0], dtype=np.float32)
+    assert "shift them first (as float32 they are rounded to 0.5 m already)" in points_from_array(far)[1][-1]
 
 
 def bad_files(folder: Path) -> list[tuple[Path, str]]:
@@ -208,7 +217,7 @@ def bad_files(folder: Path) -> list[tuple[Path, str]]:
         (folder / "flat.npy", "must hold an array of shape (N, 3 or more), got (12,)"),
         (folder / "turned.npy", "got an array of shape (4, 1000); is it transposed?"),
         (folder / "text.npy", "must hold real numbers, got an array of <U1"),
-        (folder / "object.npy", "is not a readable NumPy file (.npy), or is damaged (ValueError: "),
+        (folder / "object.npy", "(ValueError: it holds pickled objects, which could run code)"),
         (
             folder / "two.npz",
             "must hold an array named `points`, or one two-dimensional array, or x, y and z; got a, b",
@@ -219,7 +228,10 @@ def bad_files(folder: Path) -> list[tuple[Path, str]]:
             "is not a readable NumPy file (.npy), or is damaged (ValueError: it does not begin like one)",
         ),
         (folder / "cut.pcd", "is cut short: its header promises 40 points, it holds 38"),
-        (folder / "not.ply", "is not a readable PLY file, or is damaged (PlyHeaderParseError"),
+        (
+            folder / "not.ply",
+            "is not a readable PLY file, or is damaged (it has no header of the form ply ... end_header)",
+        ),
         (folder / "not.las", "is not a readable LAS file, or is damaged ("),
         (folder / "a.pkl", 'has the ending ".pkl", which no reader knows (did you mean '),
         (folder / "none.npy", "is not there"),
@@ -246,7 +258,7 @@ def test_coordinates_that_are_missing_are_named(tmp_path: Path) -> None:
 
 def test_an_absent_library_comes_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pypcd4", None)
-    with pytest.raises(BeamboxError, match=r'needs the library pypcd4: pip install "beambox\[formats\]"'):
+    with pytest.raises(BeamboxError, match=r'needs the library pypcd4: python -m pip install "\.\[formats\]"'):
         library("pypcd4", Path("a.pcd"))
 
 

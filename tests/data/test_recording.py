@@ -8,15 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.formats import columns
 from beambox.data.formats.recording import sweeps_in
 from beambox.data.reading import read_frame
 from beambox.infer.inputs import find_sweeps, read_sweep
+from beambox.infer.predictor import Detector
+from oracles.tiny_detector import tiny_model
 
 pytest.importorskip("rosbags")
 
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -126,5 +130,32 @@ def test_what_cannot_be_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
         raise ImportError(name)
 
     monkeypatch.setattr(columns.importlib, "import_module", absent)
-    with pytest.raises(BeamboxError, match=r'needs the library rosbags: pip install "beambox\[recordings\]"'):
+    with pytest.raises(BeamboxError, match=r'needs the library rosbags: python -m pip install "\.\[recordings\]"'):
         sweeps_in(path)
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
+def test_a_recording_is_opened_once_for_all_its_sweeps(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = record(tmp_path, kind)
+    opened, closed = [], []
+    for name, calls in (("open", opened), ("close", closed)):
+        real = getattr(AnyReader, name)
+        monkeypatch.setattr(AnyReader, name, lambda self, real=real, calls=calls: (calls.append(self), real(self))[1])
+    detector = Detector(tiny_model(), device="cpu", precision="float32")
+    assert [found.frame_id for found in detector.stream(path)] == ["1000000000", "1100000000", "1200000000"]
+    assert len(opened) == 1 and closed[-1:] == opened
+    assert len(detector(path)) == 3 and len(detector([path, path / "lidar" / "top" / "1100000000"])) == 4
+    assert detector(path / "lidar" / "top" / "1100000000").frame_id == "1100000000"
+
+
+def test_a_recording_written_anew_is_opened_anew(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "two").mkdir()
+    path = record(tmp_path / "one", "bag")
+    before = read_sweep(find_sweeps([path])[0])
+    other = record(tmp_path / "two", "bag", ("/other",))
+    other.replace(path)
+    assert find_sweeps([path])[0].path.parent == path / "other"
+    assert torch.equal(read_sweep(find_sweeps([path])[0]).points, before.points)

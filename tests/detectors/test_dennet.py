@@ -29,7 +29,6 @@ from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.structures import Batch
 from beambox.train.config import read_recipe
 from oracles.learning import check_found, learn_by_heart, scan_with_cars
-from oracles.paths import ROOT
 from oracles.scenes import scene
 from oracles.small_detectors import CAR, DENNET, TWO_STAGES, car_frame, made
 
@@ -79,12 +78,12 @@ def test_each_switch_removes_exactly_its_parameters() -> None:
 def test_without_its_parts_it_is_voxel_rcnn() -> None:
     plain = dennet(replace(DENNET, **OFF)).eval()
     other = voxel_rcnn(VoxelRcnnConfig(grid=DENNET.grid, pooling=DENNET.pooling, **TWO_STAGES)).eval()
-    other.load_state_dict(plain.state_dict())
+    flat = {name.replace(".convolutions.", "."): value for name, value in plain.state_dict().items()}
+    other.load_state_dict(flat)
     batch = Batch.of([car_frame(1, CAR)])
     with torch.inference_mode():
         ours, theirs = plain(batch), other(batch)
     torch.testing.assert_close(ours.first.cls, theirs.first.cls)
-    assert ours.refined is not None and theirs.refined is not None
     torch.testing.assert_close(ours.refined.codes, theirs.refined.codes)
 
 
@@ -98,22 +97,22 @@ def test_the_defaults_are_the_papers_setting() -> None:
     assert FULL.radii == (0.6, 1.8)
     assert (FULL.na_window, FULL.na_heads, FULL.max_points) == (7, (2, 4), 5)
     with torch.device("meta"):
-        first = [dennet(config).backbone.stages[0][0][0].in_channels for config in (FULL, KITTI_Z4)]
+        first = [dennet(config).backbone.stages[0].convolutions[0][0].in_channels for config in (FULL, KITTI_Z4)]
     assert first == [256 + 80, 128 + 48]
 
 
 @pytest.mark.parametrize(
     ("name", "config"),
     [
-        ("dennet_kitti", FULL),
-        ("dennet_kitti_z4", KITTI_Z4),
-        ("dennet_kitti_005", KITTI_005),
-        ("dennet_once", ONCE),
-        ("voxelrcnn_once", voxel_rcnn_module.ONCE),
+        (("dennet-kitti-3class",), FULL),
+        (("dennet-kitti-3class", "detector.options.grid.maximum=[70.4, 40.0, 1.0]"), KITTI_Z4),
+        (("dennet-kitti-3class-005",), KITTI_005),
+        (("dennet-once",), ONCE),
+        (("voxel_rcnn-once",), voxel_rcnn_module.ONCE),
     ],
 )
-def test_recipes_hold_the_named_settings(name: str, config: VoxelRcnnConfig) -> None:
-    recipe = read_recipe(ROOT / "recipes" / f"{name}.yaml")
+def test_recipes_hold_the_named_settings(name: tuple[str, ...], config: VoxelRcnnConfig) -> None:
+    recipe = read_recipe(name[0], name[1:])
     assert config_from_dict(type(config), recipe.detector.options) == config
     assert (recipe.optim.lr, recipe.optim.epochs, recipe.optim.batch) == (0.003, 100, 8)
 
@@ -123,11 +122,9 @@ def test_where_attention_stands_in_a_stage(position: AttentionPosition, at: int)
     with torch.device("meta"):
         stages = dennet(replace(FULL, na_position=position)).backbone.stages
     for stage, width, heads in zip(stages, (64, 128), (2, 4)):
-        kinds = [type(layer) for layer in stage]
-        assert len(kinds) == 8
-        assert kinds.index(NeighborhoodBlock) == at
-        assert kinds.index(CoordinateAttention) == 7
-        assert stage[at].channels == width and stage[at].attention.heads == heads
+        assert (len(stage.convolutions), len(stage.further)) == (at, 6 - at)
+        assert isinstance(stage.na, NeighborhoodBlock) and isinstance(stage.ca, CoordinateAttention)
+        assert stage.na.channels == width and stage.na.attention.heads == heads
 
 
 def test_density_reaches_the_map_beside_the_encoders() -> None:

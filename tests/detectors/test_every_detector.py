@@ -9,11 +9,12 @@ import pytest
 import torch
 from torch import nn
 
+import beambox.detectors.voxel_rcnn
+from beambox.checks import BeamboxError
 from beambox.detectors.catalogue import CATALOGUE, build, config_to_dict
-from beambox.detectors.hcnet import HeightChannelFusion
-from beambox.detectors.voxel_rcnn import VoxelRcnnPredictions
 from beambox.detectors.weights import load_weights, save_weights
 from beambox.infer.fusion import fold_batch_norms
+from beambox.layers.roi import Rois, propose
 from beambox.structures import Batch, Frame, Labels
 from oracles.learning import learn_by_heart
 from oracles.small_detectors import CAR, SMALL, VARIANTS, car_frame, first_stage, made, said, total
@@ -73,7 +74,7 @@ def test_a_compiled_detector_says_and_learns_the_same(name: str) -> None:
     gradients = []
     for model in (plain, compiled):
         torch.manual_seed(0)
-        total(model.loss(model(batch), batch.labels)).backward()
+        total(model.loss(model(batch, labels=batch.labels), batch.labels)).backward()
         gradients.append({key: value.grad for key, value in model.named_parameters()})
     assert len(runs) == len(compiled.dense), "each layer is one graph without a break, and none is passed over"
     for key, gradient in gradients[0].items():
@@ -82,19 +83,19 @@ def test_a_compiled_detector_says_and_learns_the_same(name: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_losses_reach_every_parameter(variant: str) -> None:
+def test_losses_reach_every_parameter(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     name = variant.split(":", maxsplit=1)[0]
     config = VARIANTS[variant]
     model = made(name, config)
-    for layer in model.modules():
-        if isinstance(layer, HeightChannelFusion):
-            for key, parameter in layer.named_parameters():
-                if key.endswith("bias"):
-                    nn.init.constant_(parameter, 0.5)  # so that no ReLU of the attention is shut from the start
     batch = Batch.of([car_frame(5, CAR), car_frame(6)])
-    predictions = model(batch)
-    if isinstance(predictions, VoxelRcnnPredictions):
-        predictions.rois.boxes[::2] = torch.tensor(CAR)  # as if some proposals had found the car, to be refined
+
+    def some_found_the_car(*arguments: Any) -> Rois:
+        rois = propose(*arguments)
+        rois.boxes[::2] = torch.tensor(CAR)
+        return rois
+
+    monkeypatch.setattr(beambox.detectors.voxel_rcnn, "propose", some_found_the_car)  # so that there is what to refine
+    predictions = model(batch, labels=batch.labels)
     first = first_stage(predictions)
     assert len(first.anchors) == CELLS[name] * 2 * len(config.classes)
     assert first.cls.shape == (2, len(first.anchors), len(config.classes))
@@ -124,7 +125,8 @@ def test_sweeps_without_points_give_predictions_a_loss_and_no_error(name: str, t
     predictions = model(Batch.of([empty] * count))
     assert bool(first_stage(predictions).cls.isfinite().all())
     assert len(model.decode(predictions)) == count
-    losses = model.loss(predictions, [Labels.empty()] * count)
+    nothing = [Labels.empty()] * count
+    losses = model.loss(model(Batch.of([empty] * count), labels=nothing), nothing)
     assert all(bool(loss.isfinite()) for loss in losses.values())
     total(losses).backward()
     gradients = {key: parameter.grad for key, parameter in model.named_parameters()}
@@ -187,3 +189,30 @@ def test_overfits_two_cars_and_finds_them(name: str) -> None:
     labelled = torch.tensor(cars)
     torch.testing.assert_close(best[:, :2], labelled[:, :2], atol=0.3, rtol=0)
     assert bool((torch.cos(best[:, 6] - labelled[:, 6]) > 0.9).all())
+
+
+@pytest.mark.parametrize("name", ["dennet", "kassd", "voxel_rcnn"])
+def test_predictions_to_learn_and_to_detect_are_not_mixed_up(name: str) -> None:
+    model = made(name).eval()
+    batch = Batch.of([car_frame(1, CAR)])
+    with torch.inference_mode():
+        with pytest.raises(BeamboxError, match=r"call model\(batch, labels=labels\)"):
+            model.loss(model(batch), batch.labels)
+        with pytest.raises(BeamboxError, match=r"without labels: call model\(batch\)"):
+            model.decode(model(batch, labels=batch.labels))
+
+
+@pytest.mark.parametrize("name", ["dennet", "kassd", "voxel_rcnn"])
+def test_mixed_precision_covers_the_second_step_but_not_its_answers(name: str) -> None:
+    model = made(name)
+    hidden: list[torch.dtype] = []
+    layer = model.kam.maps[0] if name == "kassd" else model.roi_head.shared[0]
+    layer.register_forward_hook(lambda _module, _given, out: hidden.append(out.dtype))
+    batch = Batch.of([car_frame(1, CAR)])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        predictions = model(batch, labels=batch.labels)
+    assert hidden == [torch.bfloat16]
+    answers = [predictions.maps, predictions.scores] if name == "kassd" else list(vars(predictions.refined).values())
+    assert [answer.dtype for answer in answers] == [torch.float32] * 2
+    total(model.loss(predictions, batch.labels)).backward()
+    assert all(bool(p.grad.isfinite().all()) for p in model.parameters() if p.grad is not None)

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -46,7 +45,7 @@ def test_the_defaults_are_the_papers_setting() -> None:
 
 
 def test_the_papers_recipe_is_the_defaults() -> None:
-    recipe = read_recipe(Path(__file__).resolve().parents[2] / "recipes" / "hcnet_kitti_car.yaml")
+    recipe = read_recipe("hcnet-kitti-car")
     assert config_from_dict(HCNetConfig, recipe.detector.options) == HCNetConfig()
 
 

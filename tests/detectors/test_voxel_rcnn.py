@@ -8,7 +8,7 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.detectors.voxel_rcnn import KITTI, ONCE, VoxelRcnnConfig, voxel_rcnn
 from beambox.structures import Batch
-from oracles.small_detectors import CAR, car_frame, made
+from oracles.small_detectors import CAR, TWO_STAGES, car_frame, made
 
 
 def test_parameters_of_the_published_network():
@@ -26,13 +26,13 @@ def test_classes_of_the_configurations():
 def test_evaluation_refines_every_proposal():
     small = made("voxel_rcnn")
     batch = Batch.of([car_frame(1, CAR), car_frame(2)])
-    assert small(batch).refined is None, "in training the loss chooses what to refine"
     small.eval()
     with torch.inference_mode():
         predictions = small(batch)
-        assert predictions.refined is not None
         assert len(predictions.refined.cls) == len(predictions.rois.boxes) <= 20
         detections = small.decode(predictions)
-        assert set(small.loss(predictions, batch.labels)) >= {"cls", "roi_cls"}
+        to_learn = small(batch, labels=batch.labels)
+        assert len(to_learn.refined.cls) == 2 * TWO_STAGES["sampling"].per_sample, "those drawn to learn from"
+        assert set(small.loss(to_learn, batch.labels)) >= {"cls", "roi_cls"}
     assert len(detections) == 2
     assert all(d.classes == ("Car",) for d in detections)

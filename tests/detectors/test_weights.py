@@ -12,7 +12,7 @@ from beambox.detectors.pointpillars import PointPillarsConfig
 from beambox.detectors.voxel_rcnn import VoxelRcnnConfig
 from beambox.detectors.weights import fill, load_weights, read_weights, save_weights
 
-OPTIONS = {"widths": [8, 8, 8], "up_widths": [8, 8, 8], "pillar_channels": 8, "depths": [0, 0, 0]}
+OPTIONS = {"widths": [8, 8, 8], "up_widths": [8, 8, 8], "voxel_channels": 8, "depths": [0, 0, 0]}
 
 
 def test_weights_come_back_with_their_configuration(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_foreign_safetensors_are_refused(tmp_path: Path) -> None:
 
 
 def test_tensors_of_another_model_are_refused_by_name_and_shape() -> None:
-    model, wider = build("pointpillars", OPTIONS), build("pointpillars", {**OPTIONS, "pillar_channels": 16})
+    model, wider = build("pointpillars", OPTIONS), build("pointpillars", {**OPTIONS, "voxel_channels": 16})
     with pytest.raises(BeamboxError, match=r"has shape \(16, .*expected \(8, "):
         fill(model, wider.state_dict(), "file")
     with pytest.raises(BeamboxError, match="lacks"):

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -12,7 +15,7 @@ from beambox.checks import BeamboxError, MissingFileError
 from beambox.cli.import_openpcdet import command
 from beambox.detectors.pointpillars import PointPillarsConfig
 from beambox.detectors.weights import load_weights
-from beambox.export.openpcdet import MODELS, import_checkpoint
+from beambox.export.openpcdet import MODELS, import_checkpoint, read_checkpoint
 
 
 def checkpoint_of(model: str, classes: int) -> tuple[nn.Module, dict[str, Tensor]]:
@@ -111,3 +114,53 @@ def test_the_command_writes_a_weight_file(tmp_path, capsys):
     assert isinstance(loaded.config, PointPillarsConfig)
     assert loaded.config.empty_slots
     assert loaded.head.cls.weight.equal(detector.head.cls.weight)
+
+
+@pytest.mark.parametrize("numpy_1", [False, True])
+def test_a_checkpoint_of_training_holds_numpy_numbers_and_is_read(tmp_path, numpy_1):
+    """OpenPCDet's one-cycle schedule puts numpy.float64 into the optimizer's state; NumPy 1 pickles by another name."""
+    detector, state = checkpoint_of("pointpillars", 3)
+    numbers = [np.float64(0.9), np.float32(0.1), np.int64(3), np.bool_(True), np.uint8(7), np.float16(0.5)]
+    path = tmp_path / "checkpoint_epoch_80.pth"
+    torch.save({"epoch": 80, "model_state": state, "optimizer_state": {"param_groups": numbers}}, path)
+    if numpy_1:
+        with zipfile.ZipFile(path) as old, zipfile.ZipFile(tmp_path / "old.pth", "w") as new:
+            for name in old.namelist():
+                content = old.read(name)
+                new.writestr(name, content.replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
+        path = tmp_path / "old.pth"
+    read = import_checkpoint(path, "pointpillars")
+    assert all(value.equal(read.state_dict()[name]) for name, value in detector.state_dict().items())
+
+
+def test_the_prefix_of_several_gpus_is_taken_off(tmp_path):
+    detector, state = checkpoint_of("second", 1)
+    read = import_checkpoint(write(tmp_path / "c.pth", {f"module.{k}": v for k, v in state.items()}), "second")
+    assert all(value.equal(read.state_dict()[name]) for name, value in detector.state_dict().items())
+
+
+def test_a_refusal_names_the_object_and_never_advises_to_run_it(tmp_path, capsys):
+    _, state = checkpoint_of("second", 1)
+    for harm in (Harm(), Path("x"), np.array([Harm()], dtype=object)):
+        path = tmp_path / "c.pth"
+        torch.save({"model_state": state, "harm": harm}, path)
+        with pytest.raises(BeamboxError, match="only running code from the file would restore") as refusal:
+            import_checkpoint(path, "second")
+        assert "weights_only" not in str(refusal.value) and "\x1b" not in str(refusal.value)
+        assert capsys.readouterr().out == ""
+
+
+def test_mutants_of_a_checkpoint_are_refused_in_one_line(tmp_path):
+    """Every part of a file may be broken; what is not noticed must still be numbers of the right shapes."""
+    rng, path = np.random.default_rng(0), tmp_path / "c.pth"
+    torch.save({"model_state": {"a": torch.zeros(3)}, "optimizer_state": [np.float64(1)]}, path)
+    whole = path.read_bytes()
+    for _ in range(60):
+        content = bytearray(whole)
+        for place in rng.integers(0, len(whole), rng.integers(1, 6)):
+            content[place] = rng.integers(0, 256)
+        path.write_bytes(content[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.2 else content)
+        try:
+            assert all(value.dim() <= 4 for value in read_checkpoint(path).values())
+        except BeamboxError as error:
+            assert "\n" not in str(error)

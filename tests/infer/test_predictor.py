@@ -123,7 +123,7 @@ def test_axes_find_the_same_in_another_frame(weights: Path, detector: Detector) 
     found = load(weights, device="cpu", precision="float32", axes="x: right, y: forward")(turned)
     plain = detector(points)
     boxes = plain.boxes[:, [1, 0, 2, 3, 4, 5, 6]] * torch.tensor([-1, 1, 1, 1, 1, 1, 1])
-    assert len(found) > 3 and nearly(Detections(boxes, plain.scores, plain.labels, plain.classes), found)
+    assert len(found) > 3 and nearly(Detections(boxes, plain.scores, plain.class_ids, plain.classes), found)
 
 
 def test_intensity_scale_undoes_another_unit(weights: Path, detector: Detector) -> None:

@@ -65,7 +65,7 @@ def test_score_once_writes_the_documented_json(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     record = json.loads((tmp_path / "o.json").read_text(encoding="utf-8"))
     assert list(record) == ["Vehicle", "Pedestrian", "Cyclist", "mean"]
-    assert record["Vehicle"] == {"overall": 100.0, "0-30m": 100.0, "30-50m": 0.0, "50m-inf": 0.0}
+    assert record["Vehicle"] == {"iou": 0.7, "overall": 100.0, "0-30m": 100.0, "30-50m": 0.0, "50m-inf": 0.0}
 
 
 @pytest.mark.parametrize("text", ["Car", "Car=x", "=0.5"])

@@ -10,7 +10,7 @@ pytestmark = [
     pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="interpreted kernels cannot be compiled"),
 ]
 
-AMPERE = 80
+AMPERE, HOPPER = 80, 90
 
 
 def compile_kernel(kernel, **arguments):
@@ -22,8 +22,9 @@ def compile_kernel(kernel, **arguments):
     assert list(arguments) == kernel.arg_names, "give every argument, in order"
     types = {name: value if isinstance(value, str) else "constexpr" for name, value in arguments.items()}
     constants = {name: value for name, value in arguments.items() if not isinstance(value, str)}
-    compiled = triton.compile(ASTSource(kernel, types, constants), target=GPUTarget("cuda", AMPERE, 32))
-    assert compiled.asm["cubin"]
+    for chip in (AMPERE, HOPPER):
+        compiled = triton.compile(ASTSource(kernel, types, constants), target=GPUTarget("cuda", chip, 32))
+        assert compiled.asm["cubin"]
 
 
 def test_overlaps_compile():
@@ -35,7 +36,14 @@ def test_overlaps_compile():
 def test_nms_compiles():
     from beambox.ops.nms import gpu
 
-    compile_kernel(gpu._mark, boxes="*fp64", overlaps="*i64", count="i32", words="i32", limit="*fp64", rows=gpu.ROWS)
+    sizes = {"overlaps": "*i64", "count": "*i64"}
+    compile_kernel(
+        gpu._mark, boxes="*fp64", **sizes, places="i32", words="i32", limit="*fp64", rows=gpu.ROWS
+    )  # fmt: skip
+    for width in (1, 64):
+        compile_kernel(
+            gpu._walk, **sizes, kept="*i64", number="*i64", places="i32", words="i32", post="i32", width=width
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize(("values", "largest"), [("*fp32", True), ("*fp64", True), ("*bf16", False)])
@@ -56,7 +64,11 @@ def test_ball_count_compiles():
 
     compile_kernel(
         gpu._count, cells="*i64", column="*i64", z="*i64", steps="*i64", heights="*i64", out="*i64", voxels="i32",
-        reach="i32", words=1, map_size="i32", block=gpu.BLOCK,
+        reach="i32", words=1, map_size="i32", radii="i32", block=gpu.BLOCK,
+    )  # fmt: skip
+    compile_kernel(
+        gpu._stack, index="*i64", cells="*i64", column="*i64", z="*i64", voxels="i32", size="i32", low_b=0, low_z=0,
+        low_y="i32", low_x="i32", height="i32", width="i32", pad_y="i32", pad_x="i32", block=gpu.BLOCK,
     )  # fmt: skip
 
 
@@ -75,4 +87,52 @@ def test_attention_compiles(kept, given, ones):
     compile_kernel(
         gpu._to_keys, q=given, weights=kept, slopes=kept, gradient=given, dk=given, dv=given, row_low="*i64",
         row_high="*i64", **sizes,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("values", "bias", "widths"),
+    [("*fp32", "*fp32", (16, 64)), ("*bf16", None, (64, 64)), ("*fp16", "*fp16", (16, 16))],
+)
+def test_sparse_convolution_compiles(values, bias, widths):
+    from beambox.ops.sparse_conv import gpu
+
+    sizes = {"rows": "i32", "offsets": "i32", "c_in": "i32", "c_out": "i32"}
+    blocks = {"block": gpu.ROWS, "in_width": widths[0], "out_width": widths[1]}
+    compile_kernel(
+        gpu._multiply, features=values, weight=values, bias=bias, table="*i32", out=values, **sizes, **blocks
+    )  # fmt: skip
+    compile_kernel(
+        gpu._accumulate, features=values, grad=values, table="*i32", parts="*fp32", **sizes, stretch="i32", **blocks
+    )  # fmt: skip
+
+
+def test_kernel_maps_compile():
+    from beambox.ops.sparse_conv import gpu_indices, gpu_maps
+
+    level = dict.fromkeys(("nz", "ny", "nx"), "i32")
+    other = dict.fromkeys(("tz", "ty", "tx"), "i32")
+    steps = {f"{name}{axis}": "i32" if name == "s" else 1 for name in "spd" for axis in "zyx"}
+    keys = {"keys": "*i64", "order": "*i64", "target_keys": "*i64", "target_order": "*i64", "table": "*i32"}
+    compile_kernel(
+        gpu_maps._look_up, **keys, rows="i32", sources="i32", steps="i32", **other, **level, offsets="i32", ky="i32",
+        kx="i32", **steps, block=gpu_maps.BLOCK,
+    )  # fmt: skip
+    compile_kernel(gpu_maps._turn_round, forward="*i32", back="*i32", total="i32", offsets="i32", block=1024)
+    for listed, source in ((True, "*i64"), (False, "*i8")):
+        compile_kernel(
+            gpu_maps._spread, source=source, active="*i8", count="i32", listed=listed, **level, **other, kz="i32",
+            ky="i32", kx="i32", **steps, block=gpu_maps.BLOCK,
+        )  # fmt: skip
+    compile_kernel(gpu_indices._take_apart, keys="*i64", order="*i64", indices="*i64", rows="i32", **level, block=256)
+
+
+@pytest.mark.parametrize("values", ["*fp32", "*fp64"])
+def test_voxel_query_compiles(values):
+    from beambox.ops.voxel_query import gpu
+
+    sizes = ("count", "sites", "steps", "nb", "nz", "ny", "nx", "rz", "ry", "rx", "samples")
+    compile_kernel(
+        gpu._search, points=values, cells="*i64", centres=values, keys="*i64", order="*i64", found="*i64", limit=values,
+        **dict.fromkeys(sizes, "i32"), block=gpu.BLOCK,
     )  # fmt: skip

@@ -23,7 +23,7 @@ def learn_by_heart(model: Any, frame: Frame, steps: int, lr: float, clip: float 
     losses = []
     for _ in range(steps):
         optimiser.zero_grad()
-        loss = total(model.loss(model(batch), batch.labels))
+        loss = total(model.loss(model(batch, labels=batch.labels), batch.labels))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), clip)
         optimiser.step()

@@ -23,7 +23,7 @@ def tiny_model(seed: int = 0) -> PointPillars:
     model = PointPillars(
         PointPillarsConfig(
             grid=GRID,
-            pillar_channels=8,
+            voxel_channels=8,
             depths=(1, 1),
             strides=(2, 2),
             widths=(8, 16),

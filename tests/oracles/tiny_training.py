@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from beambox.data.kitti import write_kitti_frame
 from beambox.data.mixture import MixedSource
 from beambox.data.source import FrameList
 from beambox.detectors.catalogue import build
-from beambox.structures import Frame, Labels
+from beambox.simulate.frames import CAMERA
+from beambox.structures import Frame, ImageAttributes, Labels
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.devices import make_fabric
 from beambox.train.feed import Feed
@@ -19,7 +22,7 @@ from beambox.train.loop import Run
 
 OPTIONS: dict[str, Any] = {
     "grid": {"minimum": [0.0, -6.4, -3.0], "maximum": [12.8, 6.4, 1.0], "cell": [0.4, 0.4, 4.0]},
-    "pillar_channels": 4,
+    "voxel_channels": 4,
     "depths": [1, 1],
     "strides": [2, 2],
     "widths": [8, 8],
@@ -40,6 +43,26 @@ def frames(count: int, seed: int = 0) -> FrameList:
         labels = Labels(torch.tensor([[*centre, 3.9, 1.6, 1.5, 0.0]]), ("Car",))
         made.append(Frame(torch.tensor(points, dtype=torch.float32), f"{number:06d}", labels))
     return FrameList(made)
+
+
+def tiny_kitti(root: Path, count: int = 5, name: str = "Car") -> Path:
+    """Write such frames in KITTI's layout, all in `train`, the first two in `val`."""
+    names = []
+    for frame in frames(count).frames:
+        assert frame.labels is not None
+        attributes = ImageAttributes(
+            torch.zeros(1),
+            torch.zeros(1, dtype=torch.int64),
+            torch.zeros(1),
+            torch.tensor([[500.0, 100.0, 600.0, 200.0]]),
+        )
+        labels = Labels(frame.labels.boxes, (name,), attributes)
+        write_kitti_frame(root, replace(frame, labels=labels, calibration=CAMERA, image_size=(1242, 375)))
+        names.append(frame.id)
+    (root / "ImageSets").mkdir()
+    (root / "ImageSets" / "train.txt").write_text("\n".join(names))
+    (root / "ImageSets" / "val.txt").write_text("\n".join(names[:2]))
+    return root
 
 
 def recipe(**optim: Any) -> Recipe:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from beambox.export.openpcdet import import_checkpoint
+from beambox.layers.encoders import mean_voxels
 from beambox.layers.roi import Rois, decode_rois
 from beambox.structures import Batch, Frame
 from oracles.paths import fixtures_dir
@@ -87,7 +88,10 @@ def test_two_stage_agrees():
         zeros = torch.zeros(len(given), dtype=torch.int64)
         with torch.inference_mode():
             predictions = network(batch)
-            refined = network.refine(Rois(given, zeros, zeros, 1), predictions.levels, network.config.grid)
+            grid = network.config.grid
+            stages = network.encoder(mean_voxels(network.voxels(batch, grid)))
+            pooled = network.roi_pool(Rois(given, zeros, zeros, 1), network.levels(stages), grid)
+            refined = network.roi_head(pooled)
             boxes = decode_rois(refined.codes, given)
         index = recorded["rpn_index"].long()
         assert relative_error(predictions.first.cls[0, index], recorded["rpn_cls"]) < RELATIVE

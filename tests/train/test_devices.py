@@ -34,5 +34,5 @@ def test_missing_fabric_is_said_with_its_remedy(monkeypatch: pytest.MonkeyPatch)
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(BeamboxError, match=r"pip install 'beambox\[train\]'"):
+    with pytest.raises(BeamboxError, match=r'pip install "\.\[train\]"'):
         make_fabric("auto")

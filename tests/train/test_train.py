@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,36 +13,16 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.cli.main import main
-from beambox.data.kitti import write_kitti_frame
 from beambox.detectors.weights import read_weights
-from beambox.simulate.frames import CAMERA
-from beambox.structures import ImageAttributes, Labels
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.log import RunLog
 from beambox.train.loop import train
-from oracles.tiny_training import OPTIONS, frames
+from oracles.tiny_training import OPTIONS, tiny_kitti
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    names = []
-    for frame in frames(5).frames:
-        assert frame.labels is not None
-        boxes = frame.labels.boxes
-        attributes = ImageAttributes(
-            torch.zeros(1),
-            torch.zeros(1, dtype=torch.int64),
-            torch.zeros(1),
-            torch.tensor([[500.0, 100.0, 600.0, 200.0]]),
-        )
-        labels = Labels(boxes, ("Car",), attributes)
-        write_kitti_frame(root, replace(frame, labels=labels, calibration=CAMERA, image_size=(1242, 375)))
-        names.append(frame.id)
-    (root / "ImageSets").mkdir()
-    (root / "ImageSets" / "train.txt").write_text("\n".join(names))
-    (root / "ImageSets" / "val.txt").write_text("\n".join(names[:2]))
-    return root
+    return tiny_kitti(tmp_path_factory.mktemp("kitti"))
 
 
 def recipe(**changes: Any) -> Recipe:
@@ -136,7 +115,7 @@ def test_train_and_evaluate_from_the_command_line(
         main(words)
     assert not ended.value.code
     capsys.readouterr()
-    words = ["evaluate", str(run), "--data", str(data), "--view", "full", "--iou", "Car=0.5"]
+    words = ["evaluate", str(run), "--data", str(data), "--view", "full", "--iou", "Car=0.7, Car=0.5"]
     words += ["--json", str(tmp_path / "scores.json"), "--results", str(tmp_path / "results")]
     with pytest.raises(SystemExit) as ended:
         main(words)
@@ -145,8 +124,11 @@ def test_train_and_evaluate_from_the_command_line(
     assert "Car, IoU > 0.70, 2 / 2 / 2 objects" in printed
     assert "Car, IoU > 0.50, 2 / 2 / 2 objects" in printed
     numbers = json.loads((tmp_path / "scores.json").read_text())
-    assert numbers["default"]["Car"]["iou"] == 0.7
-    assert numbers["given"]["Car"]["iou"] == 0.5
+    assert list(numbers) == ["Car", "Pedestrian", "Cyclist", "Car@0.5"]
+    assert numbers["Car"]["iou"] == 0.7
+    assert numbers["Car@0.5"]["iou"] == 0.5
+    assert numbers["Car"].keys() - numbers["Car@0.5"].keys() == {"errors"}
+    assert numbers["Car"]["errors"]["overall"]["objects"] == 2
     assert sorted(path.name for path in (tmp_path / "results").iterdir()) == ["000000.txt", "000001.txt"]
     with pytest.raises(SystemExit) as ended:
         main(["train", str(tmp_path / "tiny.yaml"), "--set", "optm.lr=1"])

@@ -13,7 +13,7 @@ from beambox.checks import BeamboxError
 from beambox.cli.data import app
 from beambox.data.kitti import KittiSource
 from beambox.structures import Frame
-from beambox.visualise.voxel_histogram import draw_histogram, points_per_voxel, voxel_histogram
+from beambox.visualise.voxel_histogram import BAR, draw_histogram, points_per_voxel, voxel_histogram
 from oracles.own_data import write_pandaset
 from oracles.paths import data_dir
 
@@ -56,10 +56,14 @@ def test_nothing_at_all() -> None:
 
 
 def test_bars_grow_with_their_shares() -> None:
-    one = torch.tensor([[0.05, 0.05, 0.1, 0.0]])
-    several = draw_histogram(voxel_histogram([Frame(one)], CELL, most=2), title="KITTI")
-    none = draw_histogram(voxel_histogram([], CELL, most=2), title="KITTI")
-    assert several.tobytes() != none.tobytes()
+    """Three voxels of one point and one of two: the first bar is three times as high as the second."""
+    points = torch.tensor([[0.05 + x, 0.05, 0.1, 0.0] for x in (0, 1, 2, 3, 3)])
+    picture = draw_histogram(voxel_histogram([Frame(points)], CELL, most=2), title="KITTI")
+    blue = (torch.tensor(list(picture.tobytes())).view(600, 750, 3) == torch.tensor(BAR)).all(dim=2)
+    columns = blue.sum(dim=0)
+    first, second = columns[90:410].max(), columns[410:].max()
+    assert 440 < first <= 451
+    assert abs(first - 3 * second) <= 3
 
 
 def test_real_voxels_hold_one_or_two_points() -> None:

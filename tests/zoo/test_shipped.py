@@ -7,10 +7,12 @@ import torch
 import yaml
 
 import beambox
+from beambox.detectors.weights import load_weights, warn_of_licence
 from beambox.infer.cards import read_card
 from beambox.ops.rotated_iou import iou_bev
 from beambox.simulate import simulate_frame
-from beambox.zoo import shipped
+from beambox.train.recipes import find_recipe
+from beambox.zoo import DEFAULT, shipped
 
 NAMES = sorted(shipped())
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,7 +35,7 @@ def test_a_card_stands_beside_the_weights_and_inside_them(name: str) -> None:
     assert inside.said == beside
     for key in ("summary", "licence", "trained on", "recipe", "scores"):
         assert beside.get(key), f"the card of {name} must say `{key}`"
-    assert (ROOT / beside["recipe"]).is_file()
+    assert find_recipe(beside["recipe"]).stem == name
     assert inside.detector == name.split("-", maxsplit=1)[0]
 
 
@@ -53,3 +55,22 @@ def test_finds_the_cars_near_the_sensor_in_a_simulated_street(name: str) -> None
             found += int((iou_bev(cars.boxes, boxes).amax(dim=1) > 0.5).sum())
     assert wanted >= 5
     assert found >= 0.8 * wanted
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_that_are_not_free_say_so_once(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    warn_of_licence.cache_clear()
+    for _ in range(2):
+        load_weights(shipped()[name])
+    licences = [record.getMessage() for record in caplog.records if "commercial" in record.getMessage()]
+    assert len(licences) == (0 if name.endswith("-sim") else 1)
+    assert all(name in text and "CC-BY-NC-SA-3.0" in text for text in licences)
+
+
+def test_the_default_is_free_and_every_weight_file_stands_in_the_notice() -> None:
+    assert read_card(shipped()[DEFAULT]).said["licence"] == "Apache-2.0"
+    notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
+    for name, path in shipped().items():
+        paid = read_card(path).said["licence"] != "Apache-2.0"
+        assert (f"src/beambox/zoo/{name}.safetensors" in notice) == paid
+        assert name in notice

@@ -17,9 +17,7 @@ def command(
     data: Annotated[Path | None, typer.Option(help="Folder that {data} stands for in the recipe.")] = None,
     seeds: Annotated[str, typer.Option(help="One run of each row for each of these, as 0,1,2.")] = "0",
     iterations: Annotated[int | None, typer.Option(min=1, help="Steps of each run; the recipe's by default.")] = None,
-    recipe: Annotated[
-        Path | None, typer.Option(help="Recipe of every row; the table's own in recipes/ by default.")
-    ] = None,
+    recipe: Annotated[str, typer.Option(help="Recipe of every row, by name or file; the table's own by default.")] = "",
     change: Annotated[
         list[str] | None, typer.Option("--set", help="Change a value of the recipe, in every row; may be repeated.")
     ] = None,
@@ -43,11 +41,6 @@ def command(
         print(report(chosen, {}), end="")
         return
     wanted = parse_seeds(seeds)
-    path = recipe or Path("recipes") / f"{chosen.recipe}.yaml"
-    if recipe is None and not path.is_file():
-        raise MissingFileError(
-            f"there is no {path} here; run this in the folder that holds recipes/, or give the file with --recipe"
-        )
     if data is not None and not data.is_dir():
         raise MissingFileError(f"--data: there is no folder {data}")
 
@@ -58,7 +51,7 @@ def command(
     changes = list(change or [])
     if iterations is not None:
         changes += [f"optim.iterations={iterations}", "optim.epochs=null"]
-    read = read_recipe(path, changes)
+    read = read_recipe(recipe or chosen.recipe, changes)
     try:
         measured = run_table(chosen, read, data, out, wanted, say)
     except Interrupted:

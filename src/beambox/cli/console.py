@@ -2,21 +2,67 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sys
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from typing import Any, TextIO
 
 from beambox import __version__
+from beambox.checks import printable
+from beambox.progress import track as progress
 
-__all__ = ["announce", "progress", "say", "show_log"]
+__all__ = ["LONGEST_LINE", "announce", "plain", "plain_output", "progress", "say", "show_log"]
 
-T = TypeVar("T")
+LONGEST_LINE = 2000
+"""Characters of a message; a file can hold a name of any length."""
+BARS = str.maketrans(dict(zip("▁▂▃▄▅▆▇█", "_.:-=+*#")))
+"""What stands for the bars of a histogram where the terminal has no such letters (cp1252)."""
+
+
+def plain(text: str, encoding: str | None, limit: int | None = None) -> str:
+    """Return text as a terminal can show it: nothing steers it, and letters it lacks are escapes."""
+    shown = printable(text, limit)
+    try:
+        shown.encode(encoding or "utf-8")
+        return shown
+    except UnicodeEncodeError:
+        known = encoding or "utf-8"
+    except LookupError:
+        known = "ascii"
+    return shown.translate(BARS).encode(known, "backslashreplace").decode(known)
 
 
 def say(message: str) -> None:
     """Print a line for the person at the terminal, on stderr, so that results can be piped."""
-    print(message, file=sys.stderr)
+    print(plain(message, sys.stderr.encoding, LONGEST_LINE), file=sys.stderr)
+
+
+class _Plain:
+    """A text stream through which only what :func:`plain` returns passes."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, and return how many characters were given."""
+        self._stream.write(plain(text, self._stream.encoding))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write several texts."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def plain_output() -> Iterator[None]:
+    """Let results pass to stdout without what would steer a terminal, whatever the names in files hold."""
+    with contextlib.redirect_stdout(_Plain(sys.stdout)):  # pyright: ignore[reportArgumentType]  # it writes as one
+        yield
 
 
 def announce(command: str, *, seed: int | None = None, detail: str = "") -> None:
@@ -25,17 +71,6 @@ def announce(command: str, *, seed: int | None = None, detail: str = "") -> None
     parts += [f"seed {seed}"] if seed is not None else []
     parts += [detail] if detail else []
     say(", ".join(parts))
-
-
-def progress(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """Yield items, behind a bar on stderr where that is a terminal and there is more than one."""
-    if total < 2 or not sys.stderr.isatty():
-        yield from items
-        return
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(items, description=what, total=total, console=Console(stderr=True))
 
 
 def show_log(level: int = logging.WARNING) -> None:

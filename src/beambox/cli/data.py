@@ -1,4 +1,4 @@
-"""`beambox data check|anchors|voxels`: look at a data set before training on it."""
+"""`beambox data check|anchors|voxels|splits`: look at a data set before training on it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Look at a data set: read all of it and say what seems wrong, propose anchors, count the points of voxels.",
+    help="Look at a data set: read all of it and say what seems wrong, propose anchors, count points, write lists.",
 )
 
 DATA = Annotated[Path, typer.Argument(metavar="DATA", help="YAML file of a data set, or a KITTI or ONCE folder.")]
@@ -114,6 +114,21 @@ def voxels(
         save_picture(draw_histogram(histogram, f"{data.name} {split}"), out)
 
 
+def splits(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="KITTI's folder, which holds training/velodyne.")],
+    partial: Annotated[bool, typer.Option("--partial", help="List only the frames that are there.")] = False,
+) -> None:
+    """Write KITTI's usual lists into DIR/ImageSets: train (3712 frames), val (3769), trainval and test.
+
+    Examples:
+      beambox data splits kitti
+    """
+    from beambox.data.kitti_splits import write_kitti_splits
+
+    for name, count in write_kitti_splits(folder, partial=partial).items():
+        print(f"{folder / 'ImageSets' / name}.txt: {count} frames")
+
+
 def spread(total: int, wanted: int | None) -> list[int]:
     """Return the positions of ``wanted`` frames, spread evenly over all; all of them where None."""
     if wanted is None or wanted >= total:
@@ -121,5 +136,5 @@ def spread(total: int, wanted: int | None) -> list[int]:
     return [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
 
 
-for function in (check, anchors, voxels):
+for function in (check, anchors, voxels, splits):
     app.command(help=help_of(function))(guard(function))

@@ -31,12 +31,11 @@ def command(
     """
     from beambox.infer.demo import run_demo, short_table
     from beambox.infer.predictor import load
-    from beambox.zoo import shipped
+    from beambox.zoo import DEFAULT, shipped
 
     show_log()
     start = time.perf_counter()
-    names = list(shipped())
-    name = model or next((n for n in names if n.endswith("-sim")), names[0] if names else "")
+    name = model or (DEFAULT if DEFAULT in shipped() else "")
     if not name:
         raise BeamboxError("no weights are shipped with this installation; train some and give them by --model")
     announce("demo", seed=seed, detail=name)

@@ -43,15 +43,18 @@ def command(
 
         report(environment())
         return
+    from beambox.data.existence import expect_inputs
+
+    expect_inputs(inputs)
+
     from beambox.detectors.pointpillars import KITTI_PILLARS
     from beambox.infer.doctor import examine
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
     from beambox.infer.trained import Trained
-    from beambox.zoo import shipped
+    from beambox.zoo import DEFAULT, shipped
 
-    names = list(shipped())
-    name = model or (names[0] if names else "")
+    name = model or (DEFAULT if DEFAULT in shipped() else "")
     detector = load(name, device=device, view="full", fields=fields or None) if name else None
     trained = Trained(KITTI_PILLARS) if detector is None else Trained.of(detector.card, detector.grid)
     for sweep in find_sweeps(inputs):
@@ -77,7 +80,6 @@ def report(findings: Iterable[Finding]) -> None:
 
 def try_out(path: Path, detector: Detector, diagnosis: Diagnosis) -> None:
     """Detect as given and with the remedies, and tell how many detections are sure."""
-    from beambox.infer.corrections import Corrections
     from beambox.infer.doctor import Finding
 
     def sure() -> str:
@@ -86,7 +88,10 @@ def try_out(path: Path, detector: Detector, diagnosis: Diagnosis) -> None:
 
     text = f"detections with a score of at least 0.3: {sure()} as given"
     if diagnosis.options:
-        detector.corrections, detector.intensity_scale = diagnosis.corrections, diagnosis.intensity_scale
-        text += f", {sure()} with the options below"
-        detector.corrections, detector.intensity_scale = Corrections(), None
+        before = detector.corrections, detector.intensity_scale
+        try:
+            detector.corrections, detector.intensity_scale = diagnosis.corrections, diagnosis.intensity_scale
+            text += f", {sure()} with the options below"
+        finally:
+            detector.corrections, detector.intensity_scale = before
     report([Finding("trial", "note", text)])

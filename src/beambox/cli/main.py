@@ -24,9 +24,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
+    "track": ("beambox.cli.track:command", "follow objects through a drive: identities, velocities"),
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
+    "recipes": ("beambox.cli.recipes:command", "the shipped recipes: for whom, how long, whether ever run"),
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
     "report": ("beambox.cli.report:command", "one page per evaluation: curves, errors, worst failures as pictures"),
@@ -35,6 +37,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),
     "submit": ("beambox.cli.submit:command", "check result files for KITTI's test server and pack them"),
     "export": ("beambox.cli.export:command", "write PointPillars or HCNet as an ONNX file, compared with PyTorch"),
+    "completion": ("beambox.cli.completion:command", "a script that completes commands and options in a shell"),
     "import-openpcdet": ("beambox.cli.import_openpcdet:command", "convert a checkpoint of OpenPCDet"),
     "score": ("beambox.cli.score:app", "score result files of any detector by the rules of KITTI or ONCE"),
 }
@@ -45,7 +48,7 @@ EXAMPLES = (
     ("beambox show scan.bin --model pointpillars-sim --out scan.png", "and look at them"),
     ("beambox doctor scan.bin", "why are there no detections?"),
     ("beambox simulate data --frames 200 --seed 1", "make a labelled data set"),
-    ("beambox train recipes/pointpillars_small.yaml --data data --out run", "train on it"),
+    ("beambox train pointpillars-small --data data --out run", "train on it"),
     ("beambox evaluate run --data data", "and score the result"),
 )
 
@@ -101,8 +104,9 @@ def explain(error: OSError) -> str:
 
 def stop(message: str, status: int) -> NoReturn:
     """Print one line on stderr and leave."""
-    line = " ".join(message.split())
-    print(f"beambox: {line}", file=sys.stderr)
+    from beambox.cli.console import say
+
+    say("beambox: " + " ".join(message.split()))
     raise SystemExit(status)
 
 
@@ -118,6 +122,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # torch's threads otherwise wait for their next piece of work in a loop of some ms, on a core that others want
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if os.environ.get("_BEAMBOX_WORDS"):
+        from beambox.cli.completion import complete
+
+        print("\n".join(complete(words)))
+        raise SystemExit(0)
     if not words or words[0] in ("-h", "--help", "help"):
         print(help_text())
         raise SystemExit(0)
@@ -146,7 +155,10 @@ def run(name: str, arguments: Sequence[str]) -> None:
         app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         settings = {"help_option_names": ["-h", "--help"]}
         app.command(name, help=help_of(command), context_settings=settings)(guard(command))
-    app(args=list(arguments), prog_name=f"beambox {name}")
+    from beambox.cli.console import plain_output
+
+    with plain_output():
+        app(args=list(arguments), prog_name=f"beambox {name}")
 
 
 def help_of(function: Callable[..., None]) -> str:

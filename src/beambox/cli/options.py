@@ -11,11 +11,14 @@ from beambox.checks import BeamboxError
 
 __all__ = [
     "AxesOption",
+    "ClassesOption",
+    "DefaultModelOption",
     "DeviceOption",
     "FieldsOption",
     "HeightOption",
     "InputsArgument",
     "IntensityOption",
+    "IouOption",
     "MinScoreOption",
     "ModelArgument",
     "ModelOption",
@@ -23,6 +26,7 @@ __all__ = [
     "RangeOption",
     "SlopeOption",
     "ViewOption",
+    "parse_classes",
     "parse_range",
     "parse_slope",
 ]
@@ -35,6 +39,15 @@ ModelArgument = Annotated[
 ]
 ModelOption = Annotated[
     str, typer.Option("--model", "-m", metavar="M", help="Shipped name, .safetensors file, or folder of a run.")
+]
+DefaultModelOption = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        "-m",
+        metavar="M",
+        help="Shipped name, .safetensors file, or folder of a run; pointpillars-sim if none.",
+    ),
 ]
 DeviceOption = Annotated[str, typer.Option(help="cpu, cuda, cuda:0; auto takes the GPU where there is one.")]
 PrecisionOption = Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16.")]
@@ -75,7 +88,23 @@ FieldsOption = Annotated[
 MinScoreOption = Annotated[
     float, typer.Option("--min-score", metavar="S", help="Leave out detections below this score.")
 ]
+ClassesOption = Annotated[
+    str, typer.Option("--classes", metavar="NAMES", help="Classes to score, as Car,Cyclist; by default the detector's.")
+]
+IouOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--iou",
+        metavar="NAME=IOU",
+        help="Overlaps other than the benchmark's: Car=0.5,Cyclist=0.25; or several of a class.",
+    ),
+]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+
+
+def parse_classes(text: str) -> list[str]:
+    """Read the value of --classes, each name once; an empty text names none."""
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def parse_range(text: str, option: str = "--range") -> float | list[float] | None:

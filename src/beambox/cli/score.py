@@ -1,14 +1,15 @@
-"""`beambox score kitti|once`: score result files without running a detector."""
+"""`beambox score kitti|once|tracking`: score result files without running a detector."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from beambox.checks import BeamboxError
 from beambox.cli.main import guard, help_of
+from beambox.cli.options import IouOption, parse_classes
 
 __all__ = ["app", "parse_overlaps"]
 
@@ -22,38 +23,31 @@ app = typer.Typer(
 )
 
 Json = Annotated[Path | None, typer.Option("--json", help="also write the numbers to this file")]
-Iou = Annotated[str, typer.Option("--iou", help="other IoU thresholds, for example Car=0.5,Pedestrian=0.25")]
 
 
 def parse_overlaps(text: str) -> dict[str, float]:
-    """Read IoU thresholds written as ``Car=0.5,Pedestrian=0.25``."""
-    found = {}
-    for part in filter(None, (piece.strip() for piece in text.split(","))):
-        name, sign, value = part.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            sign = ""
-        if not sign or not name.strip():
-            raise BeamboxError(f"--iou takes CLASS=NUMBER pairs such as Car=0.5,Pedestrian=0.25; cannot read {part!r}")
-    return found
+    """Read overlaps written as ``Car=0.5,Pedestrian=0.25``, one a class."""
+    from beambox.infer.evaluate import parse_overlaps as parse
+
+    return parse([text])
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write numbers for other programs."""
-    import json
+def conclude(results: Sequence[Any], tables: Sequence[str], path: Path | None) -> None:
+    """Print the tables, and write the numbers for other programs."""
+    print("\n".join(tables), end="")
+    if path is not None:
+        from beambox.io import write_json
+        from beambox.metrics.rounds import merge_entries
 
-    from beambox.io import write_text
-
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        write_json(path, merge_entries(results))
 
 
 def kitti(
     labels: Annotated[Path, typer.Option(help="folder of label files (or the KITTI root above label_2)")],
     results: Annotated[Path, typer.Option(help="folder of result files, one a frame; empty: nothing found")],
     frames: Annotated[Path | None, typer.Option(help="file with one frame name a line; default: every label")] = None,
-    classes: Annotated[str, typer.Option(help="classes to score, comma-separated")] = "Car,Pedestrian,Cyclist",
-    iou: Iou = "",
+    classes: Annotated[str, typer.Option(help="classes to score, as Car,Cyclist")] = "Car,Pedestrian,Cyclist",
+    iou: IouOption = None,
     no_difficulty: Annotated[
         bool, typer.Option("--no-difficulty", help="every object counts; 3d and bev only")
     ] = False,
@@ -69,27 +63,32 @@ def kitti(
     """
     from beambox.metrics.kitti import evaluate_files
     from beambox.metrics.kitti_objects import read_frame_list
+    from beambox.metrics.rounds import parse_rounds, score_rounds
 
-    result = evaluate_files(
-        labels,
-        results,
-        None if frames is None else read_frame_list(frames),
-        [name.strip() for name in classes.split(",") if name.strip()],
-        min_overlap=parse_overlaps(iou),
-        no_difficulty=no_difficulty,
-        python_port=python_port,
-        allow_missing=allow_missing,
+    names = None if frames is None else read_frame_list(frames)
+    results_of_rounds = score_rounds(
+        lambda wanted, overlaps: evaluate_files(
+            labels,
+            results,
+            names,
+            wanted,
+            min_overlap=overlaps,
+            no_difficulty=no_difficulty,
+            python_port=python_port,
+            allow_missing=allow_missing,
+        ),
+        parse_classes(classes),
+        parse_rounds(iou or []),
     )
-    print(result.table(), end="")
-    if json is not None:
-        write_json(json, result.to_json())
+    conclude(results_of_rounds, [result.table() for result in results_of_rounds], json)
 
 
 def once(
     annotations: Annotated[Path, typer.Option(help="JSON with ground_truth, and with predictions unless --results")],
     results: Annotated[Path | None, typer.Option(help="JSON list of predictions in a file of its own")] = None,
+    classes: Annotated[str, typer.Option(help="classes to score, as Vehicle,Cyclist; default: all")] = "",
     five_classes: Annotated[bool, typer.Option("--five-classes", help="do not merge Car, Bus, Truck")] = False,
-    iou: Iou = "",
+    iou: IouOption = None,
     true_rotation: Annotated[bool, typer.Option("--true-rotation", help="turn boxes the right way round")] = False,
     published: Annotated[bool, typer.Option("--published", help="also print the rows of DenNet's Table 3")] = False,
     json: Json = None,
@@ -101,18 +100,50 @@ def once(
       beambox score once --annotations val.json --results predictions.json --published --json ap.json
     """
     from beambox.metrics.once import evaluate_annotations
+    from beambox.metrics.rounds import parse_rounds, score_rounds
 
-    result = evaluate_annotations(
-        annotations,
-        results,
-        five_classes=five_classes,
-        min_overlap=parse_overlaps(iou),
-        true_rotation=true_rotation,
+    scored = score_rounds(
+        lambda wanted, overlaps: evaluate_annotations(
+            annotations,
+            results,
+            five_classes=five_classes,
+            min_overlap=overlaps,
+            true_rotation=true_rotation,
+            known=wanted or None,
+        ),
+        parse_classes(classes),
+        parse_rounds(iou or []),
     )
-    print(result.table(published=published), end="")
+    conclude(scored, [result.table(published=published) for result in scored], json)
+
+
+def tracking(
+    labels: Annotated[Path, typer.Option(help="label file of a drive, or folder of label files, one a drive")],
+    results: Annotated[Path, typer.Option(help="tracks of the drive, or folder of files with the labels' names")],
+    calib: Annotated[Path, typer.Option(help="calib file, or folder of files with the labels' names")],
+    classes: Annotated[str, typer.Option(help="classes to score, comma-separated")] = "Car,Pedestrian,Cyclist",
+    overlap: Annotated[str, typer.Option(help="3d, bev, or 2d as KITTI's benchmark")] = "3d",
+    iou: Iou = "",
+    json: Json = None,
+) -> None:
+    """Score tracks in KITTI's format: HOTA, MOTA, AMOTA, identity switches.
+
+    Examples:
+      beambox score tracking --labels label_02/0012.txt --results tracks.txt --calib calib/0012.txt
+      beambox score tracking --labels label_02 --results out --calib calib --classes Car --overlap 2d
+    """
+    from beambox.track.scoring import read_drives, score_tracks
+
+    result = score_tracks(
+        read_drives(labels, results, calib),
+        [name.strip() for name in classes.split(",") if name.strip()],
+        overlap=overlap,  # pyright: ignore[reportArgumentType]  # score_tracks checks it
+        min_overlap=parse_overlaps(iou),
+    )
+    print(result.table(), end="")
     if json is not None:
         write_json(json, result.to_json())
 
 
-for function in (kitti, once):
+for function in (kitti, once, tracking):
     app.command(help=help_of(function))(guard(function))

@@ -77,14 +77,18 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     a YAML file brings its own labels. A page (.html) shows points and boxes in three dimensions in any browser, several
     sweeps with a time line, and needs no other file.
     """
+    from beambox.data.existence import expect_inputs
+
+    check_choices(colour, model, results)
+    check_rate(rate)
+    expect_inputs(inputs)
+
     from beambox.cli import show_inputs
     from beambox.geometry.axes import Axes
     from beambox.infer.predictor import load
     from beambox.visualise.scene import Scene
 
     show_log()
-    check_choices(colour, model, results)
-    check_rate(rate)
     turned = Axes.parse(axes) if axes else Axes()
     shown = region_of_option(area)
     source = show_inputs.data_set_of(inputs, split)
@@ -273,7 +277,7 @@ def picture_of(scene: Scene, detector: Detector | None, shown: Region | None, co
         looked_at = Region(x0, y0, x1, y1)
     detections = scene.detections
     if detections is not None:
-        detections = detections[detections.scores >= min_score]
+        detections = detections.above(min_score)
     return draw_sweep(
         scene.frame,
         detections,

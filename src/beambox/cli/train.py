@@ -11,28 +11,26 @@ __all__ = ["command"]
 
 
 def command(
-    recipe: Annotated[Path, typer.Argument(help="YAML file of the run; the shipped ones lie in recipes/.")],
+    recipe: Annotated[
+        str, typer.Argument(help="Name of a shipped recipe (`beambox recipes` lists them), or a YAML file.")
+    ],
     data: Annotated[Path | None, typer.Option(help="Folder that {data} stands for in the recipe.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME where not given.")] = None,
     change: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a value: optim.lr=0.001; may be repeated.")
+        list[str] | None,
+        typer.Option("--set", help="Change a value, in all stages: optim.lr=0.001; may be repeated."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the folder's last checkpoint.")] = False,
 ) -> None:
     """Train a detector.
 
-    On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox.cli.main train RECIPE --data DIR
+    Examples:
+      beambox train pointpillars-small --data data --out run
+      beambox train mine.yaml --data data --set optim.lr=0.001
+
+    On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox train RECIPE --data DIR
     """
-    from beambox.train.config import read_recipe
+    from beambox.verbs import train
 
-    parsed = read_recipe(recipe, change or [])
-    if data is not None and not data.is_dir():
-        from beambox.checks import MissingFileError
-
-        raise MissingFileError(f"--data: there is no folder {data}")
-
-    from beambox.train.loop import train
-
-    outcome = train(parsed, data, out or Path("runs") / parsed.name, resume)
-    if not outcome.finished:
+    if not train(recipe, data, out, overrides=change or [], resume=resume).finished:
         raise typer.Exit(130)

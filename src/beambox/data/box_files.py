@@ -2,9 +2,10 @@
 
 pandaset
     text, one box a line: ``label x y z l w h yaw [points sensor uuid]``, centres; lines that begin with # are left out.
+    ``x y z l w h yaw label``, as OpenPCDet's custom data have it, is told from it by its numbers.
 csv
     a header line with name, x, y, z, l, w, h, yaw in any order, and frame where one file holds all frames; further
-    columns are left out.
+    columns are left out. Columns are parted by commas; yaw_deg instead of yaw is in degrees.
 json
     a list of objects ``{"name", "x", "y", "z", "l", "w", "h", "yaw"}`` or ``{"name", "box": [7 numbers]}``, with
     "frame" where one file holds all frames; or what ``beambox detect --format json`` writes.
@@ -18,7 +19,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,18 +31,29 @@ from numpy.typing import NDArray
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.kitti_text import parse_labels
 from beambox.geometry.calibration import Calibration
+from beambox.io import parse_json, word_to_name
 
-__all__ = ["CAMERA_AT_THE_SENSOR", "NamedBoxes", "parse_box_file", "parse_frames_file", "parse_kitti_boxes"]
+__all__ = [
+    "CAMERA_AT_THE_SENSOR",
+    "NamedBoxes",
+    "box_words",
+    "parse_box_file",
+    "parse_frames_file",
+    "parse_kitti_boxes",
+]
 
 NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw")
 ALIASES = {
-    "name": ("name", "label", "class", "type", "category"),
-    "frame": ("frame", "frame_id", "scan", "sweep"),
-    "l": ("l", "length", "dx"),
-    "w": ("w", "width", "dy"),
-    "h": ("h", "height", "dz"),
-    "yaw": ("yaw", "heading", "theta", "rotation"),
+    "name": ("name", "label", "class", "type", "category", "class_name", "object_type", "obj_type"),
+    "frame": ("frame", "frame_id", "scan", "sweep", "frame_name"),
+    **{axis: (axis, f"c{axis}", f"center_{axis}", f"centre_{axis}", f"{axis}_center", f"pos_{axis}") for axis in "xyz"},
+    "l": ("l", "length", "dx", "size_x"),
+    "w": ("w", "width", "dy", "size_y"),
+    "h": ("h", "height", "dz", "size_z"),
+    "yaw": ("yaw", "heading", "theta", "rotation", "rotation_z", "rot_z", "rz", "yaw_rad", "heading_rad"),
 }
+DEGREES = ("yaw_deg", "yaw_degrees", "heading_deg", "heading_degrees", "rotation_deg", "yaw(deg)", "yaw (deg)")
+LONGEST_CELL = 10_000
 CAMERA_AT_THE_SENSOR = Calibration(
     p2=torch.tensor([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
     r0=torch.eye(3),
@@ -118,8 +129,9 @@ def _collect(rows: Iterable[tuple[str, Sequence[float], str]]) -> NamedBoxes:
 def _floats(words: Sequence[Any], place: str) -> list[float]:
     try:
         return [float(word) for word in words]
-    except (TypeError, ValueError):
-        raise BeamboxError(f"{place}: expected numbers x y z l w h yaw, got {list(words)}") from None
+    except (TypeError, ValueError, OverflowError):
+        shown = ", ".join(str(word)[:20] for word in words)
+        raise BeamboxError(f"{place}: expected numbers x y z l w h yaw, got {shown}") from None
 
 
 def _pandaset_rows(text: str, where: str) -> Iterable[Row]:
@@ -128,44 +140,91 @@ def _pandaset_rows(text: str, where: str) -> Iterable[Row]:
         if not words or words[0].startswith("#"):
             continue
         place = f"{where}, line {number}"
-        if len(words) < 8:
-            raise BeamboxError(f"{place}: expected label x y z l w h yaw, got {len(words)} columns")
-        yield None, words[0], _floats(words[1:8], place), place
+        name, numbers = box_words(words, place)
+        yield None, name, _floats(numbers, place), place
+
+
+def box_words(words: Sequence[str], place: str) -> tuple[str, Sequence[str]]:
+    """Part the words of ``class x y z l w h yaw``, or of ``x y z l w h yaw class``, into name and seven numbers.
+
+    Raises:
+        BeamboxError: if there are fewer than eight.
+    """
+    if len(words) < 8:
+        raise BeamboxError(f"{place}: expected `class x y z l w h yaw`, got {len(words)} columns")
+    if all(map(_numeric, words[:7])) and not _numeric(words[7]):
+        return word_to_name(words[7]), words[:7]
+    return word_to_name(words[0]), words[1:8]
+
+
+def _numeric(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _columns(known: Iterable[str], place: str) -> dict[str, str]:
     """Find the names under which a file has its columns."""
     have = {str(name).strip().lower(): name for name in known}
-    found = {}
+    degrees = next((have[name] for name in DEGREES if name in have), None)
+    found = {} if degrees is None else {"degrees": degrees}
     for wanted in ("frame", "name", *NUMBERS):
         match = next((have[alias] for alias in ALIASES.get(wanted, (wanted,)) if alias in have), None)
         if match is not None:
             found[wanted] = match
+        elif wanted == "yaw" and degrees is not None:
+            found[wanted] = degrees
         elif wanted != "frame":
             raise BeamboxError(f"{place}: there is no column `{wanted}`{did_you_mean(wanted, map(str, have))}")
     return found
 
 
 def _csv_rows(text: str, where: str) -> Iterable[Row]:
-    reader = csv.DictReader(io.StringIO(text))
-    if reader.fieldnames is None:
-        raise BeamboxError(f"{where} is empty; expected a header line with name, x, y, z, l, w, h, yaw")
-    columns = _columns(reader.fieldnames, f"{where}, line 1")
-    for row in reader:
-        place = f"{where}, line {reader.line_num}"
-        frame = row[columns["frame"]] if "frame" in columns else None
-        yield frame, str(row[columns["name"]]), _floats([row[columns[key]] for key in NUMBERS], place), place
-
-
-def _json(text: str, where: str) -> Any:
+    head, _, _ = text.partition("\n")
+    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+        if head.count(mark) > head.count(","):
+            raise BeamboxError(
+                f"{where}, line 1: the columns are parted by {name}, expected commas (and points in numbers); save it "
+                "as comma-separated values, or give labels per frame as text (format: pandaset)"
+            )
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise BeamboxError(f"{where} is not valid JSON: {error}") from None
+        rows = [
+            (number, [cell.strip() for cell in row])
+            for number, row in enumerate(csv.reader(io.StringIO(text), skipinitialspace=True), start=1)
+            if any(cell.strip() for cell in row)
+        ]
+    except csv.Error as error:
+        raise BeamboxError(f"{where} is no table of comma-separated values: {error}") from None
+    if not rows:
+        raise BeamboxError(f"{where} is empty; expected a header line with name, x, y, z, l, w, h, yaw")
+    header = rows[0][1]
+    columns = {key: header.index(name) for key, name in _columns(header, f"{where}, line 1").items()}
+    for number, row in rows[1:]:
+        place = f"{where}, line {number}"
+        if len(row) != len(header):
+            raise BeamboxError(f"{place}: expected {len(header)} columns as in the header, got {len(row)}")
+        if max(map(len, row)) > LONGEST_CELL:
+            raise BeamboxError(f"{place}: a cell has {max(map(len, row))} letters")
+        frame = row[columns["frame"]] if "frame" in columns else None
+        yield (
+            frame,
+            row[columns["name"]],
+            _yaw_in_radians([row[columns[key]] for key in NUMBERS], columns, place),
+            place,
+        )
+
+
+def _yaw_in_radians(words: Sequence[Any], columns: Mapping[str, Any], place: str) -> list[float]:
+    numbers = _floats(words, place)
+    if columns.get("degrees") is not None and columns["degrees"] == columns["yaw"]:
+        numbers[6] = math.radians(numbers[6])
+    return numbers
 
 
 def _json_rows(text: str, where: str) -> Iterable[Row]:
-    content = _json(text, where)
+    content = parse_json(text, where)
     frame = None
     if isinstance(content, dict) and isinstance(content.get("detections"), list):
         frame, content = content.get("frame"), content["detections"]
@@ -179,12 +238,12 @@ def _json_rows(text: str, where: str) -> Iterable[Row]:
         entry = {**given, **(dict(zip(NUMBERS, box)) if isinstance(box, list) and len(box) == 7 else {})}
         columns = _columns(entry, place)
         own = entry[columns["frame"]] if "frame" in columns else frame
-        numbers = _floats([entry[columns[key]] for key in NUMBERS], place)
+        numbers = _yaw_in_radians([entry[columns[key]] for key in NUMBERS], columns, place)
         yield None if own is None else str(own), str(entry[columns["name"]]), numbers, place
 
 
 def _once_rows(text: str, where: str) -> Iterable[Row]:
-    content = _json(text, where)
+    content = parse_json(text, where)
     frames = content.get("frames") if isinstance(content, Mapping) else None
     if not isinstance(frames, list):
         raise BeamboxError(f"{where}: expected a list under the key `frames`")

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from beambox.data.checking import FLOATING, TELLING_POINTS, BoxFacts, DataReport
+from beambox.data.checking import FLOATING, SOME_FRAMES, TELLING_POINTS, BoxFacts, DataReport
+from beambox.data.placements import AS_LABELLED, MISTAKES
 
 __all__ = ["class_rows", "report_json", "report_text", "warnings"]
 
@@ -17,6 +18,8 @@ UNEVEN = 0.2
 """The ground may lie this far from where the sensor's height puts it, metres; more costs 3-D overlap."""
 STEEP = 0.02
 """A ground that leans by this much in most frames is reported, metres a metre; KITTI's rises by 0.008 ahead."""
+FILLED_SHARE = 0.2
+"""Fewer boxes than this share with points in them are those of other frames."""
 FEW_BOXES = 5
 """Fewer telling boxes than this do not accuse a class."""
 
@@ -64,6 +67,7 @@ def warnings(report: DataReport, ground: float | None = None) -> list[str]:
             out.append(f"intensity runs from {low:g} to {high:g}; networks expect 0 to 1: set intensity_scale")
         elif high == 0:
             out.append("intensity is 0 everywhere; train without it, or look whether another column holds it")
+    out += [*_scales(report), *_points(report), *_placements(report), *_image_boxes(report)]
     for row in class_rows(report):
         out += _class_warnings(report, row)
     if ground is not None and report.ground:
@@ -72,6 +76,65 @@ def warnings(report: DataReport, ground: float | None = None) -> list[str]:
             side = "above" if wrong > 0 else "below"
             out.append(f"the ground lies {abs(wrong):.2f} m {side} where sensor_height puts it; {_advice(wrong)}")
     return out + _leaning(report)
+
+
+def _scales(report: DataReport) -> Iterator[str]:
+    """Tell of an intensity whose scale was found differently from frame to frame."""
+    if len(report.scales) > 1:
+        told = ", ".join(f"by {scale} in {count} frames" for scale, count in sorted(report.scales.items()))
+        yield f"intensity was divided {told}, by what each frame holds: set intensity_scale so that all are alike"
+
+
+def _points(report: DataReport) -> Iterator[str]:
+    if report.reach and np.median(report.reach) > 1000:
+        yield (
+            f"95 % of the points of a frame lie within {np.median(report.reach):.4g} of the origin: these are "
+            "millimetres or map coordinates, metres around the sensor are expected"
+        )
+    elif report.reach and np.median(report.reach) < 3:
+        yield f"95 % of the points of a frame lie within {np.median(report.reach):.2g} m of the origin; metres expected"
+    for up, count in report.up.items():
+        if count > MANY * min(len(report.reach), SOME_FRAMES):
+            yield f"the ground is a layer across the axis {up[-1]} and {up} is up, but z is expected to be: set axes"
+
+
+def _placements(report: DataReport) -> Iterator[str]:
+    """Name the mistake that would explain boxes without points in them."""
+    if report.beyond_a_turn:
+        yield (
+            f"yaw of {report.beyond_a_turn} boxes is larger than a full turn: is it in degrees? Radians are expected "
+            "(a table may call the column yaw_deg)"
+        )
+    if report.placed < FEW_BOXES or not report.placements:
+        return
+    here = report.placements[AS_LABELLED][0]
+    best = max(MISTAKES, key=lambda name: report.placements[name])
+    there = report.placements[best][0]
+    share = here / report.placed
+    if share < MANY and there > max(FEW_BOXES - 1, 1.5 * here):
+        yield (
+            f"{here} of {report.placed} boxes hold points above the ground as labelled, but {there} {best}: "
+            f"{MISTAKES[best][1]}"
+        )
+    elif share < FILLED_SHARE:
+        yield (
+            f"only {here} of {report.placed} boxes hold points above the ground: are the labels those of other frames, "
+            "or in other axes or units than the points?"
+        )
+
+
+def _image_boxes(report: DataReport) -> Iterator[str]:
+    without, total = report.image_boxes
+    if any("all image boxes are" in note for note in report.notes):
+        yield (
+            "all image boxes are 0 (labels made without a camera): KITTI's difficulty levels are unknown, nothing is "
+            "filtered by them; score with --no-difficulty"
+        )
+    elif without > 0.05 * total:
+        yield (
+            f"{without} of {total} boxes have no box in the image: KITTI's rules neither sample nor score them "
+            "(beyond level hard)"
+        )
 
 
 def _leaning(report: DataReport) -> list[str]:
@@ -111,6 +174,13 @@ def _class_warnings(report: DataReport, row: dict[str, Any]) -> Iterator[str]:
     length, width = np.median(boxes[:, 3]), np.median(boxes[:, 4])
     if length < 0.8 * width:
         yield f"{name}: length {length:.2f} m is less than width {width:.2f} m; are l and w swapped?"
+    if np.median(boxes[:, 5]) > max(2.5, 1.3 * length):
+        yield (
+            f"{name}: height {np.median(boxes[:, 5]):.2f} m is more than length {length:.2f} m; are the sizes in the "
+            "order h, w, l?"
+        )
+    if length > 100:
+        yield f"{name}: length {length:.4g}: metres are expected; are these millimetres or centimetres?"
     long = (np.maximum(boxes[:, 3], boxes[:, 4]) > 1.4 * np.minimum(boxes[:, 3], boxes[:, 4])) & _telling(facts)
     better = facts.across[long] > 1.1 * here[long]
     if long.sum() >= FEW_BOXES and better.mean() > MANY:
@@ -149,7 +219,9 @@ def report_text(report: DataReport, ground: float | None = None) -> str:
     lines = [f"{report.frames} frames, {int(np.median(counts))} points a frame (from {min(counts)} to {max(counts)})"]
     if report.ground:
         lines.append(f"ground under the origin at z = {np.median(report.ground):.2f} m")
-    lines += [f"{number} frames: {note}" for note, number in report.notes.items()]
+    for note, number in report.notes.items():
+        texts = report.note_texts.get(note, {note})
+        lines.append(f"{number} frames: {next(iter(texts)) if len(texts) == 1 else note}")
     head = f"{'class':<18}{'boxes':>7}{'frames':>7}{'empty':>7}{'outside':>8}{'points':>8}{'l':>7}{'w':>6}{'h':>6}"
     lines += ["", head + f"{'z':>7}{'gap':>7}{'far':>7}"]
     for row in class_rows(report):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError
+from beambox.data.placements import BEYOND_A_TURN, count_filled, up_axis
 from beambox.data.road import height_and_slope
 from beambox.data.source import FrameSource
 from beambox.ops.points_in_boxes import points_in_boxes_mask
@@ -24,6 +25,10 @@ MARGIN = 0.1
 """Boxes are widened by this much on all sides when their heading is looked at, metres."""
 NEARBY = 2.0
 """Points this far around a box tell where the ground is, metres."""
+SOME_FRAMES = 20
+"""Frames in which the axis that is up is looked for."""
+MANY_BOXES = 500
+"""So many boxes tell whether they lie where their points are."""
 FLOATING = 0.5
 """A class whose boxes stand this far from the ground is reported, metres."""
 
@@ -133,7 +138,23 @@ class DataReport:
     intensity: list[tuple[float, float]] = field(default_factory=list)
     """Lowest and highest intensity of each frame."""
     notes: dict[str, int] = field(default_factory=dict)
-    """What reading had to decide, and in how many frames."""
+    """What reading had to decide, and in how many frames; # stands for digits that differ from frame to frame."""
+    note_texts: dict[str, set[str]] = field(default_factory=dict)
+    """The texts behind each of them."""
+    scales: dict[str, int] = field(default_factory=dict)
+    """What the intensity was divided by ("1" where it was not), and in how many frames."""
+    reach: list[float] = field(default_factory=list)
+    """Distance within which 95 % of the points of each frame lie, metres."""
+    up: dict[str, int] = field(default_factory=dict)
+    """Axis other than +z that is up, and in how many frames."""
+    placements: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Boxes that hold something, and points in them, as labelled and after usual mistakes; over a few frames."""
+    placed: int = 0
+    """Boxes that ``placements`` looked at."""
+    beyond_a_turn: int = 0
+    """Boxes whose yaw is larger than a full turn in radians."""
+    image_boxes: tuple[int, int] = (0, 0)
+    """Boxes without a box in the image, and boxes in all, where labels have such boxes."""
     by_class: dict[str, ClassFacts] = field(default_factory=dict)
     """Facts of each class."""
 
@@ -149,9 +170,11 @@ class DataReport:
         for note in frame.notes:
             told = "".join("#" if letter.isdigit() else letter for letter in note)
             self.notes[told] = self.notes.get(told, 0) + 1
+            self.note_texts.setdefault(told, set()).add(note)
         if len(frame):
             values = frame.points[:, 3]
             self.intensity.append((float(values.min()), float(values.max())))
+            self._add_points(frame)
         else:
             self.without_points.append(frame.id)
         if frame.plane is not None:
@@ -164,6 +187,7 @@ class DataReport:
         if not len(frame.labels):
             self.without_boxes.append(frame.id)
             return
+        self._add_placements(frame)
         facts = inspect_boxes(frame)
         names = np.array(frame.labels.names)
         x, y = facts.boxes[:, 0], facts.boxes[:, 1]
@@ -174,6 +198,31 @@ class DataReport:
             held = self.by_class.setdefault(name, ClassFacts())
             held.parts.append(facts.only(rows))
             held.outside += int((rows & ~inside).sum())
+
+    def _add_points(self, frame: Frame) -> None:
+        scale = next((note.split()[-1] for note in frame.notes if note.startswith("intensity divided by ")), "1")
+        self.scales[scale] = self.scales.get(scale, 0) + 1
+        some = frame.points[:: max(1, len(frame) // 10_000), :3].double()
+        self.reach.append(float(some.norm(dim=1).quantile(0.95)))
+        if len(self.reach) <= SOME_FRAMES:
+            up = up_axis(frame.points)
+            if up is not None:
+                self.up[up] = self.up.get(up, 0) + 1
+
+    def _add_placements(self, frame: Frame) -> None:
+        assert frame.labels is not None
+        self.beyond_a_turn += int((frame.labels.boxes[:, 6].abs() > BEYOND_A_TURN).sum())
+        attributes = frame.labels.attributes
+        if attributes is not None:
+            image = attributes.image
+            without = int(((image[:, 2] <= image[:, 0]) | (image[:, 3] <= image[:, 1])).sum())
+            self.image_boxes = (self.image_boxes[0] + without, self.image_boxes[1] + len(image))
+        if self.placed > MANY_BOXES or not len(frame):
+            return
+        self.placed += len(frame.labels)
+        for name, (filled, points) in count_filled(frame).items():
+            boxes, total = self.placements.get(name, (0, 0))
+            self.placements[name] = (boxes + filled, total + points)
 
 
 def check_frames(

@@ -7,7 +7,7 @@ known. No camera is needed; there are no difficulty levels, and the metrics give
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,13 +24,13 @@ from beambox.data.box_files import (
     parse_kitti_boxes,
 )
 from beambox.data.custom_config import CustomConfig, read_custom_config
-from beambox.data.kitti_text import read_calibration
+from beambox.data.kitti_calibration import read_calibration
 from beambox.data.names import NameList
-from beambox.data.reading import read_frame
+from beambox.data.reading import read_shifted
 from beambox.data.road import fit_road_plane
 from beambox.geometry.axes import Axes, turn_boxes
 from beambox.geometry.boxes import wrap_angle
-from beambox.io import read_text
+from beambox.io import read_names, read_text
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.structures import Frame, Labels
 
@@ -62,6 +62,7 @@ class CustomSource:
         self.axes = Axes.parse(self.config.axes)
         self._ids = _frame_names(self.root, self.config, split, self.path)
         self._all_boxes = self._read_all_boxes()
+        self._refuse_labels_of_other_frames()
 
     @property
     def ids(self) -> Sequence[str]:
@@ -87,23 +88,29 @@ class CustomSource:
         path = self.root / _fill(self.config.points, name)
         if not path.is_file():
             raise MissingFileError(f"{path} is not there, the sweep of frame {name}")
-        frame = read_frame(path, fields=self.config.fields, intensity_scale=self.config.intensity_scale)
+        frame, shift = read_shifted(path, fields=self.config.fields, intensity_scale=self.config.intensity_scale)
         points = frame.points.clone()
         points[:, :3] = points[:, :3] @ self.axes.matrix.T.to(points)
         points[:, 2] += self.config.shift(points)
-        labels = self.labels(index)
+        labels = self._placed(self._boxes(name), shift)
         if not self.whole:
             points, labels = self._crop(points, labels)
         return replace(frame, points=points, id=name, labels=labels, plane=fit_road_plane(points))
 
     def labels(self, index: int) -> Labels | None:
         """Read the boxes of a frame, and no points; None where the frame has no label file."""
-        found = self._boxes(self._ids[index])
+        return self._placed(self._boxes(self._ids[index]), (0.0, 0.0))
+
+    def _placed(self, found: NamedBoxes | None, shift: tuple[float, float]) -> Labels | None:
+        """Turn a file's boxes into the house's frame; ``shift`` was taken from x and y of the points."""
         if found is None:
             return None
-        boxes = turn_boxes(torch.from_numpy(found.boxes), self.axes.matrix)
+        given = torch.from_numpy(found.boxes).clone()
+        given[:, :2] -= torch.tensor(shift, dtype=given.dtype)
+        boxes = turn_boxes(given, self.axes.matrix)
         boxes[:, 2] += self.config.shift(boxes)
-        boxes[:, 6] = wrap_angle(boxes[:, 6])
+        if not self.whole:  # a check of the data must see degrees as they are written
+            boxes[:, 6] = wrap_angle(boxes[:, 6])
         names = [self.config.class_of(name, place) for name, place in zip(found.names, found.places)]
         keep = [k for k, name in enumerate(names) if name is not None]
         return Labels(boxes[keep], tuple(name for name in names if name is not None))
@@ -133,6 +140,31 @@ class CustomSource:
             return None
         return parse_frames_file(read_text(self.root / pattern), kind, str(self.root / pattern))
 
+    def _refuse_labels_of_other_frames(self) -> None:
+        """Refuse labels that name no sweep: nothing would be trained on, without a word.
+
+        A table may hold frames whose sweeps are elsewhere; it is refused where no frame of it has a sweep, or where a
+        frame is called nearly as a sweep (Excel writes 123 for 000123).
+        """
+        if self.config.labels is None:
+            return
+        sweeps = set(_fitting(self.root, self.config.points)) | set(self._ids)
+        where = self.root / self.config.labels
+        if self._all_boxes is None:
+            files = _fitting(self.root, self.config.labels)
+            if files and not sweeps & set(files):
+                hint = _near(files[0], sweeps)
+                raise BeamboxError(f"{where}: none of the {len(files)} label files is called as a sweep{hint}")
+            return
+        strange = [name for name in self._all_boxes if name not in sweeps]
+        alike = {_bare(name): name for name in sweeps}
+        for name in strange:
+            if _bare(name) in alike:
+                raise BeamboxError(f'frame "{name}" of {where} is no sweep; is it {alike[_bare(name)]}?')
+        if strange and len(strange) == len(self._all_boxes):
+            hint = _near(strange[0], sweeps)
+            raise BeamboxError(f"{where}: none of its {len(strange)} frames is a sweep{hint}")
+
     def _crop(self, points: Tensor, labels: Labels | None) -> tuple[Tensor, Labels | None]:
         if self.config.range is not None:
             points = points[_inside(points, self.config.range)]
@@ -141,6 +173,17 @@ class CustomSource:
             counts = points_in_boxes_mask(points[:, :3], labels.boxes).sum(dim=1)  # (M,)
             labels = labels[counts >= self.config.min_points]
         return points, labels
+
+
+def _bare(name: str) -> str:
+    """Return a frame's name without what tools drop or add: zeros in front, folders, an ending."""
+    return name.replace("\\", "/").rsplit("/", 1)[-1].split(".")[0].lstrip("0").lower()
+
+
+def _near(name: str, sweeps: Collection[str]) -> str:
+    return (
+        f': "{name}", but sweeps are called {", ".join(sorted(sweeps)[:2])}{did_you_mean(name, list(sweeps)[:10_000])}'
+    )
 
 
 def _fill(pattern: str, name: str) -> str:
@@ -155,28 +198,34 @@ def _inside(rows: Tensor, limits: tuple[float, float, float, float]) -> Tensor:
 def _frame_names(root: Path, config: CustomConfig, split: str, where: Path) -> NameList:
     if split in config.splits:
         listing = root / config.splits[split]
-        names = NameList(read_text(listing, f"the list of the split {split}").split())
-        if not len(names):
-            raise BeamboxError(f"{listing} must name the frames of the split {split}, one a line, but is empty")
-        repeated = names.first_repeated()
-        if repeated is not None:
-            raise BeamboxError(f"{listing} must name each frame once, but names {repeated} again")
-        return names
+        return NameList(read_names(listing, f"the list of the split {split}"))
     if split != "all":
         raise BeamboxError(f'{where} has no split "{split}"{did_you_mean(split, [*config.splits, "all"])}')
     pattern = Path(config.points)
-    folder, (begin, end) = root / pattern.parent, pattern.name.split("{frame}", 1)
-    if "{frame}" in str(pattern.parent):
-        raise BeamboxError(f"{where}: to find all frames, {{frame}} must stand in the file's name; or give `splits`")
-    if not folder.is_dir():
-        raise MissingFileError(f"{folder}, the folder of the sweeps, is not there")
+    if pattern.name.count("{frame}") != 1 or "{frame}" in str(pattern.parent):
+        raise BeamboxError(
+            f"{where}: to find all frames, {{frame}} must stand once in the file's name of `points`, and in none of "
+            f"its folders, got {config.points}; or list them under `splits`"
+        )
+    if not (root / pattern.parent).is_dir():
+        raise MissingFileError(f"{root / pattern.parent}, the folder of the sweeps, is not there")
+    found = _fitting(root, config.points)
+    if not found:
+        raise BeamboxError(f"{root / pattern.parent} holds no sweep {_fill(pattern.name, '*')}")
+    return NameList(found)
+
+
+def _fitting(root: Path, path: str) -> list[str]:
+    """Return the names that stand for {frame} in the files there are; none where it stands in a folder's name."""
+    pattern = Path(path)
+    folder = root / pattern.parent
+    if pattern.name.count("{frame}") != 1 or "{frame}" in str(pattern.parent) or not folder.is_dir():
+        return []
+    begin, end = pattern.name.split("{frame}")
     with os.scandir(folder) as entries:
         files = (entry.name for entry in entries)
-        found = sorted(
+        return sorted(
             file[len(begin) : len(file) - len(end)]
             for file in files
             if file.startswith(begin) and file.endswith(end) and len(file) > len(begin) + len(end)
         )
-    if not found:
-        raise BeamboxError(f"{folder} holds no sweep {_fill(pattern.name, '*')}")
-    return NameList(found)

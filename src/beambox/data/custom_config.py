@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.geometry.axes import Axes, level_shift
-from beambox.io import read_text
+from beambox.io import read_yaml
 
 __all__ = ["KITTI_GROUND", "CustomConfig", "GroundSlope", "read_custom_config"]
 
@@ -55,7 +55,7 @@ class CustomConfig(BaseModel):
     """How the ground rises; points and boxes are shifted in z so that it lies level."""
     fields: str | None = None
     """Columns of .bin and .npy files, as ``x,y,z,intensity,ring``; ``_`` leaves one out."""
-    intensity_scale: float | None = Field(default=None, gt=0)
+    intensity_scale: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     """Factor that brings the intensity to 0..1; found from the numbers without it."""
     classes: dict[str, list[str]]
     """Class wanted -> names in the files that it takes in."""
@@ -92,6 +92,8 @@ class CustomConfig(BaseModel):
     @field_validator("range", mode="before")
     @classmethod
     def _one_number_or_four(cls, value: Any) -> Any:
+        if isinstance(value, int) and abs(value) > 10**9:
+            raise ValueError("range is far beyond any sensor")
         return (-value, -value, value, value) if isinstance(value, int | float) and value > 0 else value
 
     @field_validator("axes")
@@ -103,6 +105,9 @@ class CustomConfig(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> CustomConfig:
+        for key in ("points", "labels", "calibration"):
+            if "\0" in (getattr(self, key) or ""):
+                raise ValueError(f"{key} holds a zero byte")
         if "{frame}" not in self.points:
             raise ValueError(f"points must contain {{frame}}, as velodyne/{{frame}}.bin; got {self.points!r}")
         if not self.classes:
@@ -115,6 +120,8 @@ class CustomConfig(BaseModel):
                 if name in taken or name in self.ignore:
                     raise ValueError(f"the name {name!r} stands in {taken.get(name, 'ignore')} and in {wanted}")
                 taken[name] = wanted
+        if self.range is not None and not all(map(math.isfinite, self.range)):
+            raise ValueError(f"range must be finite numbers of metres, got {list(self.range)}")
         if self.range is not None and not (self.range[0] < self.range[2] and self.range[1] < self.range[3]):
             raise ValueError(f"range is x0, y0, x1, y1 with x0 < x1 and y0 < y1, got {list(self.range)}")
         return self
@@ -159,10 +166,7 @@ def read_custom_config(path: Path) -> CustomConfig:
     Raises:
         BeamboxError: naming the file and every key that is wrong.
     """
-    try:
-        values = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise BeamboxError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    values = read_yaml(path)
     if not isinstance(values, dict):
         raise BeamboxError(f"{path} must hold keys such as points, labels and classes")
     try:

@@ -4,7 +4,8 @@
 
     ROOT/
       points/NAME.bin  (.npy .npz .pcd .ply .las .laz)
-      labels/NAME.txt          a line an object: class x y z l w h yaw  (metres, radians; # begins a comment)
+      labels/NAME.txt          a line an object: class x y z l w h yaw  (metres, radians; # begins a comment);
+                               x y z l w h yaw class, as OpenPCDet's custom data have it, is read as well
       ImageSets/train.txt      optional lists of names; where absent, every sweep
 
 x, y, z is the box's geometric centre; yaw grows counter-clockwise seen from above, 0 along +x. Further columns of a
@@ -21,8 +22,9 @@ from pathlib import Path
 import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.data.box_files import box_words
 from beambox.data.reading import SUFFIXES, read_frame
-from beambox.io import read_text
+from beambox.io import name_to_word, read_names, read_text
 from beambox.structures import Frame, Labels
 
 __all__ = ["FolderSource", "format_boxes", "parse_boxes"]
@@ -97,10 +99,7 @@ def _names(sets: Path, split: str) -> list[str]:
     if not listing.exists():
         known = [*(path.stem for path in sets.glob("*.txt")), "all"]
         raise MissingFileError(f'{listing} is not there: no split "{split}"{did_you_mean(split, known)}')
-    names = read_text(listing).split()
-    if not names:
-        raise BeamboxError(f"{listing} must name the frames of the split, one a line, but is empty")
-    return names
+    return read_names(listing)
 
 
 def parse_boxes(text: str, where: str = "labels") -> Labels:
@@ -118,10 +117,9 @@ def parse_boxes(text: str, where: str = "labels") -> Labels:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        if len(words) < 8:
-            raise BeamboxError(f"{where}, line {number}: expected `class x y z l w h yaw`, got {len(words)} columns")
+        name, numbers = box_words(words, f"{where}, line {number}")
         try:
-            values = [float(word) for word in words[1:8]]
+            values = [float(word) for word in numbers]
         except ValueError:
             values = [math.nan]
         if not all(map(math.isfinite, values)):
@@ -129,8 +127,8 @@ def parse_boxes(text: str, where: str = "labels") -> Labels:
                 f"{where}, line {number}: expected a class and 7 numbers, got {' '.join(words[:8])[:60]!r}"
             )
         if min(values[3:6]) < 0:
-            raise BeamboxError(f"{where}, line {number}: l, w and h must be at least 0, got {' '.join(words[4:7])}")
-        names.append(words[0])
+            raise BeamboxError(f"{where}, line {number}: l, w and h must be at least 0, got {' '.join(numbers[3:6])}")
+        names.append(name)
         rows.append(values)
     return Labels(torch.tensor(rows, dtype=torch.float32).reshape(-1, 7), tuple(names))
 
@@ -138,6 +136,6 @@ def parse_boxes(text: str, where: str = "labels") -> Labels:
 def format_boxes(labels: Labels) -> str:
     """Write lines of ``class x y z l w h yaw``; inverse of :func:`parse_boxes` to a tenth of a millimetre."""
     return "".join(
-        " ".join([name, *(f"{value:.4f}" for value in box)]) + "\n"
+        " ".join([name_to_word(name), *(f"{value:.4f}" for value in box)]) + "\n"
         for name, box in zip(labels.names, labels.boxes.tolist())
     )

@@ -3,7 +3,7 @@
 .. code-block:: text
 
     ROOT/
-      ImageSets/train.txt val.txt test.txt    one frame name a line; where absent, every frame of the folder
+      ImageSets/train.txt val.txt test.txt    one frame name a line; `beambox data splits ROOT` writes KITTI's
       training/  (testing/ for the split "test")
         velodyne/000000.bin                   float32 x, y, z, reflectance
         calib/000000.txt                      needed for labels and for the camera's view
@@ -14,29 +14,33 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
-from beambox.data.formats.binary import read_bin
-from beambox.data.kitti_text import (
+from beambox.data.kitti_calibration import (
     CALIBRATION_REMEDY,
     format_calibration,
-    format_labels,
     parse_calibration,
+    read_calibration,
+)
+from beambox.data.kitti_text import (
+    DONT_CARE,
+    format_labels,
     parse_labels,
     parse_plane,
     parse_results,
-    read_calibration,
     read_labels,
     read_results,
 )
+from beambox.data.reading import read_frame
 from beambox.geometry import Calibration
-from beambox.io import read_text, write_bytes, write_text
+from beambox.io import check_file_name, read_names, read_text, write_bytes, write_text
 from beambox.structures import Frame, Labels
 
 __all__ = [
@@ -69,8 +73,9 @@ class KittiSource:
         Args:
             root: the folder that holds training/ and ImageSets/ (or itself velodyne/).
             split: name of a list in ImageSets/; "test" reads the folder testing/, all others training/; "all" is every
-                frame of training/.
-            fov: keep only the points that the camera sees; KITTI labels only those.
+                frame of training/. Without lists only "all" and "test" (every frame of testing/) are there.
+            fov: keep only the points that the camera sees; KITTI labels only those. Where no label has an image box
+                there was no camera, and all points are kept.
             labels: read label_2 where it is there.
 
         Raises:
@@ -102,26 +107,28 @@ class KittiSource:
         name = self._ids[index]
         calibration = self._calibration_if_there(name)
         notes: tuple[str, ...] = ()
+        camera = self.has_image_boxes or self._image_path(name) is not None
+        if not camera:
+            notes = ("all image boxes are 0 (labels made without a camera): no difficulty levels, no camera's view",)
         if calibration is None:
             self._refuse_without_calibration(name)
-            notes = (f"no calib/{name}.txt: {CALIBRATION_REMEDY}",)
-        raw = torch.from_numpy(read_bin(self.path("velodyne", name)))
-        if not math.isfinite(float(raw.sum())):  # far cheaper than to look at every number, and hardly ever so
-            finite = raw.isfinite().all(dim=1)
-            notes += (f"dropped {int((~finite).sum())} of {len(raw)} points that are NaN or infinite",)
-            raw = raw[finite]
+            notes += (f"no calib/{name}.txt: {CALIBRATION_REMEDY}",)
+        sweep = self.path("velodyne", name)
+        if not sweep.is_file():
+            raise MissingFileError(f"{sweep} is not there, the sweep of frame {name}")
+        read = read_frame(sweep)
         image_path = self._image_path(name)
         frame = Frame(
-            points=raw,
+            points=read.points,
             id=name,
             labels=self._labels(name, calibration),
             calibration=calibration,
             image_path=image_path,
-            image_size=self.image_size(index) if calibration is not None else None,
+            image_size=self.image_size(index) if calibration is not None and camera else None,
             plane=self._plane(name, calibration),
-            notes=notes,
+            notes=notes + read.notes,
         )
-        return frame.camera_view() if self.fov else frame
+        return frame.camera_view() if self.fov and camera else frame
 
     def path(self, kind: str, name: str) -> Path:
         """Path of one file: kind is velodyne, calib, label_2, image_2 or planes; it need not exist."""
@@ -136,7 +143,27 @@ class KittiSource:
         """Read the labels of a frame, and no points; None where there is no label file."""
         name = self._ids[index]
         path = self.path("label_2", name)
-        return read_labels(path, self.calibration(index)) if path.exists() else None
+        return self._labels_of(path, self.calibration(index)) if path.exists() else None
+
+    @cached_property
+    def has_image_boxes(self) -> bool:
+        """Whether any label has a box in the image.
+
+        None has where there was no camera, and KITTI's levels are then unknown. Looks through label files until one
+        tells; True where there are none.
+        """
+        told = None
+        for name in self._ids:
+            path = self.path("label_2", name)
+            if path.exists():
+                told = image_boxes_told(read_text(path), told)
+                if told:
+                    return True
+        return told is not False
+
+    def _labels_of(self, path: Path, calibration: Calibration) -> Labels:
+        labels = read_labels(path, calibration)
+        return labels if self.has_image_boxes else replace(labels, attributes=None)
 
     def image_size(self, index: int) -> tuple[int, int]:
         """(width, height) of a frame's image in pixels, from the PNG header; 1242 x 375 where there is none."""
@@ -165,13 +192,28 @@ class KittiSource:
         path = self.path("label_2", name)
         if calibration is None or not self.with_labels or not path.exists():
             return None
-        return read_labels(path, calibration)
+        return self._labels_of(path, calibration)
 
     def _plane(self, name: str, calibration: Calibration | None) -> torch.Tensor | None:
         path = self.path("planes", name)
         if calibration is None or not path.exists():
             return None
         return parse_plane(read_text(path), calibration, str(path))
+
+
+def image_boxes_told(text: str, told: bool | None = None) -> bool | None:
+    """Tell whether a label file's objects have boxes in the image: None (or what was known) where it has no object."""
+    for line in text.splitlines():
+        words = line.split()
+        if len(words) >= 8 and words[0].lower() != DONT_CARE.lower():
+            told = False
+            try:
+                left, top, right, bottom = map(float, words[4:8])
+            except ValueError:
+                return True  # whoever reads the labels says what is wrong
+            if right > left and bottom > top:
+                return True
+    return told
 
 
 def _frame_folder(root: Path, part: str) -> Path:
@@ -187,16 +229,15 @@ def _frame_folder(root: Path, part: str) -> Path:
 
 def _frame_names(root: Path, folder: Path, split: str) -> list[str]:
     sets = next((place for place in (root / "ImageSets", folder.parent / "ImageSets") if place.is_dir()), None)
-    listing = None if sets is None else sets / f"{split}.txt"
-    if listing is not None and listing.exists():
-        names = read_text(listing).split()
-        if not names:
-            raise BeamboxError(f"{listing} must name the frames of the split, one a line, but is empty")
-        if len(set(names)) < len(names):
-            twice = next(name for i, name in enumerate(names) if name in names[:i])
-            raise BeamboxError(f"{listing} must name each frame once, but names {twice} again")
-        return names
-    if sets is not None and split != "all" and split not in TEST_SPLITS:
+    listing = (sets or root / "ImageSets") / f"{check_file_name(split, 'the split')}.txt"
+    if listing.exists():
+        return read_names(listing)
+    if split != "all" and split not in TEST_SPLITS:
+        if sets is None:
+            raise MissingFileError(
+                f'{listing} is not there, so nobody knows which frames belong to "{split}"; `beambox data splits '
+                f'{root}` writes KITTI\'s usual lists of 3712 and 3769 frames, and the split "all" is every frame'
+            )
         known = [path.stem for path in sets.glob("*.txt")]
         raise MissingFileError(f'{listing} is not there: no split "{split}"{did_you_mean(split, [*known, "all"])}')
     names = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
@@ -231,8 +272,7 @@ def write_kitti_frame(root: Path | str, frame: Frame, part: str = "training") ->
         BeamboxError: if the frame has no id, or labels but no calibration.
     """
     folder = Path(root) / part
-    if not frame.id or Path(frame.id).name != frame.id:
-        raise BeamboxError(f'a frame needs an id that can name a file, such as "000000", got {frame.id!r}')
+    check_file_name(frame.id, "a frame to write")
     if frame.labels is not None and frame.calibration is None:
         raise BeamboxError(
             f"frame {frame.id} has labels but no calibration; KITTI's label files are in camera coordinates"
@@ -247,4 +287,6 @@ def write_kitti_frame(root: Path | str, frame: Frame, part: str = "training") ->
 
 def write_split(root: Path | str, split: str, names: Sequence[str]) -> None:
     """Write ImageSets/<split>.txt."""
+    for name in (split, *names):
+        check_file_name(name, "a split to write")
     write_text(Path(root) / "ImageSets" / f"{split}.txt", "".join(f"{name}\n" for name in names))

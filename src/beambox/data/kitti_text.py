@@ -1,4 +1,4 @@
-"""KITTI's text files: calibration, labels, results and road planes, parsed and formatted (KITTI devkit)."""
+"""KITTI's text files: labels, results and road planes, parsed and formatted (KITTI devkit)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
+from beambox.data.kitti_calibration import finite_numbers, format_calibration, parse_calibration, read_calibration
 from beambox.geometry import Calibration
-from beambox.io import read_text
+from beambox.io import name_to_word, read_text, word_to_name
 from beambox.structures import Detections, ImageAttributes, Labels
 
 __all__ = [
@@ -34,64 +35,6 @@ LABEL_COLUMNS = 15
 RESULT_COLUMNS = 16
 FARTHEST = 1e9
 """No number of a label file is larger than this."""
-CALIBRATION_REMEDY = "boxes live in the camera's frame, so labels and the camera's view need it; points alone do not"
-# the object benchmark's key first, then those of the tracking benchmark and of the raw recordings
-CALIBRATION_KEYS = {
-    "P2": (("P2", "P_rect_02"), (3, 4)),
-    "R0_rect": (("R0_rect", "R_rect", "R_rect_00"), (3, 3)),
-    "Tr_velo_to_cam": (("Tr_velo_to_cam", "Tr_velo_cam", "Tr"), (3, 4)),
-}
-
-
-def parse_calibration(text: str, where: str = "calibration") -> Calibration:
-    """Parse a calib file by key; the order of lines and further keys do not matter.
-
-    Args:
-        text: content of the file.
-        where: what to call it in messages, such as its path.
-
-    Raises:
-        BeamboxError: if P2, R0_rect or Tr_velo_to_cam is absent, has a wrong count of numbers, or is not finite.
-    """
-    lines: dict[str, tuple[int, list[str]]] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        key, _, rest = line.strip().partition(" ")
-        if key:
-            lines[key.rstrip(":")] = (number, rest.split())
-    matrices = []
-    for key, (names, shape) in CALIBRATION_KEYS.items():
-        found = next((name for name in names if name in lines), None)
-        if found is None:
-            hint = did_you_mean(key, lines)
-            raise BeamboxError(f"{where}: expected a line `{key}:` with {math.prod(shape)} numbers, got none{hint}")
-        number, words = lines[found]
-        values = _numbers(words, f"{where}, line {number} ({found})")
-        if len(values) != math.prod(shape):
-            raise BeamboxError(
-                f"{where}, line {number}: expected {math.prod(shape)} numbers for `{found}`, got {len(values)}"
-            )
-        matrices.append(torch.tensor(values, dtype=torch.float64).reshape(shape))
-    calibration = Calibration(*matrices)
-    if float(torch.linalg.det(calibration.r0 @ calibration.velo_to_cam[:, :3]).abs()) < 1e-6:
-        raise BeamboxError(
-            f"{where}: expected rotations in `R0_rect` and `Tr_velo_to_cam`, got matrices without inverse"
-        )
-    return calibration
-
-
-def read_calibration(path: Path) -> Calibration:
-    """Read a calib file; see :func:`parse_calibration`."""
-    return parse_calibration(read_text(path, CALIBRATION_REMEDY), str(path))
-
-
-def format_calibration(calibration: Calibration) -> str:
-    """Write a calib file's text; the cameras other than camera 2 get its matrix, the IMU the identity."""
-    entries = [(f"P{camera}:", calibration.p2) for camera in range(4)]
-    entries += [("R0_rect:", calibration.r0), ("Tr_velo_to_cam:", calibration.velo_to_cam)]
-    entries += [("Tr_imu_to_velo:", torch.eye(3, 4, dtype=torch.float64))]
-    return "".join(
-        " ".join([key, *(f"{value:.12e}" for value in matrix.flatten().tolist())]) + "\n" for key, matrix in entries
-    )
 
 
 @dataclass(frozen=True)
@@ -182,7 +125,7 @@ def format_labels(labels: Labels, calibration: Calibration, image_size: tuple[in
             attributes = ImageAttributes(zeros.double(), zeros, seen.alpha, seen.image, camera)
     middle = torch.cat((attributes.alpha[:, None].double(), attributes.image.double(), camera), dim=1)  # (N, 12)
     lines = [
-        f"{name} {cut:.2f} {hidden} " + " ".join(f"{value:.2f}" for value in row)
+        f"{name_to_word(name, DONT_CARE)} {cut:.2f} {hidden} " + " ".join(f"{value:.2f}" for value in row)
         for name, cut, hidden, row in zip(
             labels.names, attributes.truncation.tolist(), attributes.occlusion.tolist(), middle.tolist()
         )
@@ -204,7 +147,7 @@ def parse_plane(text: str, calibration: Calibration, where: str = "plane") -> Te
     filled = [number for number, line in enumerate(lines, start=1) if line.strip()]
     words = lines[filled[-1] - 1].split() if filled else []
     place = f"{where}, line {filled[-1]}" if filled else where
-    values = _numbers(words, place)
+    values = finite_numbers(words, place)
     if len(values) != 4:
         raise BeamboxError(f"{place}: expected 4 numbers a b c d of the road plane, got {len(values)}")
     plane = torch.tensor(values, dtype=torch.float64)
@@ -214,19 +157,6 @@ def parse_plane(text: str, calibration: Calibration, where: str = "plane") -> Te
     if length < 1e-9 or plane[2].abs() < 0.1 * length:
         raise BeamboxError(f"{place}: expected the plane of a road, got one that stands upright: {' '.join(words)}")
     return (plane / (length * plane[2].sign())).float()
-
-
-def _numbers(words: Sequence[str], where: str) -> list[float]:
-    values = []
-    for word in words:
-        try:
-            value = float(word)
-        except ValueError:
-            raise BeamboxError(f'{where}: expected numbers, got "{word[:40]}"') from None
-        if not math.isfinite(value):
-            raise BeamboxError(f'{where}: expected finite numbers, got "{word}"')
-        values.append(value)
-    return values
 
 
 def _parse_rows(text: str, where: str, columns: tuple[int, ...]) -> _Rows:
@@ -239,17 +169,17 @@ def _parse_rows(text: str, where: str, columns: tuple[int, ...]) -> _Rows:
         place = f"{where}, line {number}"
         if len(words) not in columns:
             raise BeamboxError(f"{place}: expected {wanted} columns, got {len(words)}")
-        values = _numbers(words[1:], place)
+        values = finite_numbers(words[1:], place)
         if max(map(abs, values)) > FARTHEST:
             raise BeamboxError(f"{place}: expected metres, pixels and radians, got {max(values, key=abs):g}")
-        if words[0] == DONT_CARE:
+        if words[0].lower() == DONT_CARE.lower():
             ignored.append(values[3:7])
             continue
         if min(values[7:10]) < 0:
             raise BeamboxError(
                 f"{place}: height, width and length (columns 9 to 11) must be at least 0, got {' '.join(words[8:11])}"
             )
-        names.append(words[0])
+        names.append(word_to_name(words[0]))
         rows.append(values if len(values) == LABEL_COLUMNS else [*values, math.nan])
     return _Rows(
         tuple(names),

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.names import NameList
 from beambox.data.reading import read_frame
-from beambox.io import read_bytes, read_text, write_bytes, write_text
+from beambox.io import check_file_name, read_json, read_names, write_bytes, write_text
 from beambox.structures import Frame, Labels
 
 __all__ = ["ONCE_CLASSES", "OnceSource", "write_once_sequence", "write_once_split"]
@@ -67,7 +67,7 @@ class OnceSource:
         mapping: Mapping[str, str | None] | None = None,
         labelled: bool = True,
         keep_empty: bool = False,
-        intensity_scale: float = 1.0,
+        intensity_scale: float | None = None,
     ) -> None:
         """Read the JSON files of a split's sequences.
 
@@ -77,7 +77,8 @@ class OnceSource:
             mapping: class in the files -> class wanted, None to leave it out; without it ONCE's five classes.
             labelled: leave out frames without a box, as the public toolbox does, in val too; False keeps every frame.
             keep_empty: of the labelled frames, keep those without a box as well.
-            intensity_scale: factor for intensity; the public toolbox takes it as it is.
+            intensity_scale: factor for intensity, found from the numbers where None, as on every path; the public
+                toolbox takes it as it is (1.0).
 
         Raises:
             MissingFileError: if the folder, the split's list or a sequence's file is not there.
@@ -156,9 +157,9 @@ def _sequence_names(root: Path, split: str) -> list[str]:
     folder = root / "data"
     if not folder.is_dir():
         raise MissingFileError(f"{root} must hold the folder data/ (ONCE's layout), and it is not there")
-    listing = root / "ImageSets" / f"{split}.txt"
+    listing = root / "ImageSets" / f"{check_file_name(split, 'the split')}.txt"
     if listing.is_file():
-        names = read_text(listing).split()
+        names = read_names(listing)
     elif split == "all":
         names = sorted(path.name for path in folder.iterdir() if path.is_dir())
     else:
@@ -171,11 +172,7 @@ def _sequence_names(root: Path, split: str) -> list[str]:
 
 def _read_sequence(path: Path, mapping: Mapping[str, str | None], classes: Sequence[str]) -> _Sequence:
     """Read a sequence's JSON and keep only names, boxes and classes."""
-    raw = read_bytes(path, "every sequence of data/ has a file of its own name")
-    try:
-        content = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise BeamboxError(f"{path} is not valid JSON: {error}") from None
+    content = read_json(path, "every sequence of data/ has a file of its own name")
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list):
         raise BeamboxError(f"{path}: expected a list under the key `frames`, got {type(frames).__name__}")
@@ -185,7 +182,8 @@ def _read_sequence(path: Path, mapping: Mapping[str, str | None], classes: Seque
         where = f"{path}, frames[{number}]"
         if not isinstance(frame, dict) or "frame_id" not in frame:
             raise BeamboxError(f"{where}: the key `frame_id` is missing")
-        names.append(str(frame["frame_id"]))
+        named = frame["frame_id"]
+        names.append(check_file_name(str(named) if isinstance(named, int) else named, where))
         annotations = frame.get("annos")
         labelled.append(annotations is not None)
         if annotations is None:
@@ -212,8 +210,12 @@ def _annotations(annotations: Any, where: str) -> tuple[NDArray[np.float32], lis
             raise BeamboxError(f"{where}.annos: expected a list under the key `{key}`")
     words = [str(name) for name in annotations["names"]]
     try:
-        rows = np.array(annotations["boxes_3d"], dtype=np.float32).reshape(-1, 7)
-    except (TypeError, ValueError):
+        with np.errstate(over="ignore"):
+            rows = np.array(annotations["boxes_3d"], dtype=np.float32)
+        rows = rows.reshape(0, 7) if rows.size == 0 else rows
+        if rows.ndim != 2 or rows.shape[1] != 7:
+            raise ValueError(rows.shape)
+    except (TypeError, ValueError, OverflowError):
         raise BeamboxError(f"{where}.annos.boxes_3d: expected rows of 7 numbers x y z l w h yaw") from None
     if len(rows) != len(words):
         raise BeamboxError(f"{where}.annos: {len(words)} names but {len(rows)} boxes_3d")
@@ -246,11 +248,12 @@ def write_once_sequence(
     Raises:
         BeamboxError: if a frame has no id that can name a file, or repeats one.
     """
-    folder = Path(root) / "data" / sequence
+    folder = Path(root) / "data" / check_file_name(sequence, "a sequence to write")
     entries: dict[str, dict[str, Any]] = {}
     for frame in frames:
-        if not frame.id or Path(frame.id).name != frame.id or frame.id in entries:
-            raise BeamboxError(f"a frame needs an id of its own that can name a file, got {frame.id!r}")
+        check_file_name(frame.id, "a frame to write")
+        if frame.id in entries:
+            raise BeamboxError(f"each frame needs an id of its own, got {frame.id} again")
         points = frame.points[:, :4].cpu().numpy().astype("<f4")
         write_bytes(folder / "lidar_roof" / f"{frame.id}.bin", points.tobytes())
         entry: dict[str, Any] = {"sequence_id": sequence, "frame_id": frame.id, "pose": [0, 0, 0, 1, 0, 0, 0]}
@@ -266,4 +269,6 @@ def write_once_sequence(
 
 def write_once_split(root: Path | str, split: str, sequences: Sequence[str]) -> None:
     """Write the list of a split's sequences."""
+    for name in (split, *sequences):
+        check_file_name(name, "a split to write")
     write_text(Path(root) / "ImageSets" / f"{split}.txt", "".join(f"{name}\n" for name in sequences))

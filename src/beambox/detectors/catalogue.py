@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.detectors.dennet import DenNetConfig, dennet
+from beambox.detectors.dennet import DenNetConfig, dennet, names_since
 from beambox.detectors.hcnet import HCNetConfig, hcnet
 from beambox.detectors.kassd import KassdConfig, kassd
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
+from beambox.detectors.renames import current_fields, current_names
 from beambox.detectors.second import SecondConfig, second
 from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
 
-__all__ = ["CATALOGUE", "CatalogueEntry", "build", "config_from_dict", "config_to_dict"]
+__all__ = ["CATALOGUE", "CatalogueEntry", "build", "config_from_dict", "config_to_dict", "tensors_since"]
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -26,10 +30,12 @@ class CatalogueEntry:
 
     config: type
     build: Callable[[Any], nn.Module]
+    renames: Callable[[Any], Mapping[str, str]] = lambda _config: {}
+    """For a configuration: how the names of tensors began in former versions -> how they begin now."""
 
 
 CATALOGUE: dict[str, CatalogueEntry] = {
-    "dennet": CatalogueEntry(DenNetConfig, dennet),
+    "dennet": CatalogueEntry(DenNetConfig, dennet, names_since),
     "hcnet": CatalogueEntry(HCNetConfig, hcnet),
     "kassd": CatalogueEntry(KassdConfig, kassd),
     "pointpillars": CatalogueEntry(PointPillarsConfig, pointpillars),
@@ -67,6 +73,11 @@ def name_of(model: nn.Module) -> str:
     raise BeamboxError(f"{type(model).__name__} is not in the catalogue of detectors")
 
 
+def tensors_since(model: nn.Module, tensors: Mapping[str, T]) -> dict[str, T]:
+    """Return tensors of a weight file or a checkpoint under the names that the model gives them now."""
+    return current_names(tensors, CATALOGUE[name_of(model)].renames(getattr(model, "config")))  # noqa: B009
+
+
 def config_to_dict(config: Any) -> dict[str, Any]:
     """Turn a configuration into plain values that :func:`config_from_dict` reads back."""
     return TypeAdapter(type(config)).dump_python(config, mode="json")
@@ -78,13 +89,15 @@ def config_from_dict(config_type: type, options: Mapping[str, Any]) -> Any:
     Raises:
         BeamboxError: naming the field, with the nearest known one where it does not exist.
     """
-    complete = _completed(options, config_to_dict(config_type()), config_type.__name__)
+    complete = _completed(current_fields(options), config_to_dict(config_type()), config_type.__name__)
     try:
         return TypeAdapter(config_type).validate_python(complete)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise BeamboxError(f"`{where}`: {first['msg']}, got {first['input']!r}") from None
+        where, given = ".".join(str(part) for part in first["loc"]), first["input"]
+        words = re.findall("'([^']+)'", first.get("ctx", {}).get("expected", "")) if first["type"] == "enum" else []
+        hint = did_you_mean(given, words) if words and isinstance(given, str) else ""
+        raise BeamboxError(f"`{where}`: {first['msg']}, got {given!r}{hint}") from None
 
 
 def _completed(options: Mapping[str, Any], defaults: Mapping[str, Any], owner: str, prefix: str = "") -> dict[str, Any]:

@@ -8,12 +8,13 @@ from typing import Any, Protocol, TypeVar
 import torch
 from torch import Tensor, nn
 
+from beambox.checks import BeamboxError
 from beambox.geometry.grid import VoxelGrid
 from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["DetectorConfig", "DetectorModel", "detections_from", "targets_from"]
+__all__ = ["DetectorConfig", "DetectorModel", "detections_from", "expect_made", "targets_from"]
 
 
 class DetectorConfig(Protocol):
@@ -41,8 +42,9 @@ P = TypeVar("P")
 class DetectorModel(Protocol[P]):
     """A network, its loss and its decoding.
 
-    ``predictions = model(batch)``, ``losses = model.loss(predictions, labels)``,
-    ``detections = model.decode(predictions)``. The model keeps parameters, not results.
+    To detect: ``predictions = model(batch)``, ``detections = model.decode(predictions)``. To learn:
+    ``predictions = model(batch, labels=labels)``, ``losses = model.loss(predictions, labels)``: a network with a second
+    step looks, given labels, at the boxes it can learn from. The model keeps parameters, not results.
     """
 
     config: Any
@@ -52,16 +54,30 @@ class DetectorModel(Protocol[P]):
         """Layers that work on whole maps: what it pays to compile, as training does with ``compile: true``."""
         ...
 
-    def __call__(self, batch: Batch, grid: VoxelGrid | None = None) -> P:
-        """Predict. ``grid``: another region with cells of the same size; the configured one where None."""
+    def __call__(self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None) -> P:
+        """Predict.
+
+        Args:
+            batch: sweeps.
+            grid: another region with cells of the same size; the configured one where None.
+            labels: ground truth of each sweep, from which a second step chooses what it learns on; None to detect.
+        """
         ...
 
     def loss(self, predictions: P, labels: Sequence[Labels]) -> dict[str, Tensor]:
-        """Return named scalars, each already weighted: their sum is the total."""
+        """Return named scalars, each already weighted: their sum is the total.
+
+        Raises:
+            BeamboxError: where the network has a second step and predicted without labels.
+        """
         ...
 
     def decode(self, predictions: P) -> list[Detections]:
-        """Return the detections of each sample, best first."""
+        """Return the detections of each sample, best first.
+
+        Raises:
+            BeamboxError: where the network has a second step and predicted with labels.
+        """
         ...
 
     def parameters(self) -> Iterator[nn.Parameter]:
@@ -71,6 +87,14 @@ class DetectorModel(Protocol[P]):
     def state_dict(self) -> Mapping[str, Tensor]:
         """As :class:`torch.nn.Module`'s."""
         ...
+
+
+def expect_made(with_labels: bool, wanted: bool) -> None:
+    """Refuse to learn from predictions made to detect, and to detect from those made to learn."""
+    if wanted and not with_labels:
+        raise BeamboxError("`loss` needs predictions made with labels: call model(batch, labels=labels)")
+    if with_labels and not wanted:
+        raise BeamboxError("`decode` needs predictions made without labels: call model(batch)")
 
 
 def detections_from(kept: Sequence[tuple[Tensor, Tensor, Tensor]], classes: tuple[str, ...]) -> list[Detections]:

@@ -45,7 +45,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from beambox.checks import BeamboxError, expect_same_length, expect_shape
+from beambox.checks import BeamboxError, choose_fields, chosen, expect_same_length, expect_shape
 from beambox.detectors.second import KITTI_VOXELS, ONCE_VOXELS
 from beambox.detectors.voxel_rcnn import (
     COARSE_POOLING,
@@ -56,18 +56,26 @@ from beambox.detectors.voxel_rcnn import (
 )
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass
-from beambox.layers.bev import BN_EPS, BN_MOMENTUM, BevBackbone
+from beambox.layers.bev import (
+    BN_EPS,
+    BN_MOMENTUM,
+    conv_bn_relu,
+    deconv_bn_relu,
+    expect_levels_meet,
+    join_levels,
+)
 from beambox.layers.encoders import mean_voxels
 from beambox.layers.heads import PostProcess
 from beambox.layers.roi import ProposalLimits
 from beambox.layers.roi_pool import PoolLevel
 from beambox.layers.sparse import levels_left, sparse_block
-from beambox.ops.ball_count import ball_count
+from beambox.ops.ball_count import ball_counts
 from beambox.ops.ball_count.reference import TOLERANCE
 from beambox.ops.neighborhood import neighborhood_attention
 from beambox.ops.sparse_conv import Sites, SparseTensor, linear_keys
 from beambox.ops.voxelize import Voxels
 from beambox.structures.batch import Batch
+from beambox.structures.labels import Labels
 
 __all__ = [
     "DENNET_VOXELS",
@@ -170,6 +178,7 @@ class DenNetConfig(VoxelRcnnConfig):
     """Channels over hidden channels, of which there are at least 8 (Hou et al. 2021)."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         super().__post_init__()
         expect_same_length(widths=len(self.widths), na_heads=len(self.na_heads))
         if self.na_window < 1 or self.na_window % 2 == 0:
@@ -215,8 +224,13 @@ class DenNet(TwoStage):
             channels += self.density.bev_channels(levels)
         self.backbone = AttentiveBackbone(channels, config)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> VoxelRcnnPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        With ``labels`` the second stage looks at regions drawn to learn from, without at the best proposals.
+        """
         grid = self.config.grid if grid is None else grid
         points = self.voxels(batch, grid)
         voxels = mean_voxels(points, self.config.absolute_xy)  # (V, columns)
@@ -225,13 +239,19 @@ class DenNet(TwoStage):
         if self.density is not None:
             maps = torch.cat((maps, self.density(voxels.sites, points)), dim=1)  # (B, 256 + 80, ny / 8, nx / 8)
         bev = self.backbone(maps)  # (B, 256, ny / 8, nx / 8)
-        return self.detect(stages, bev, grid)
+        first = self.head(bev, grid)
+        rois, targets = self.regions(first, labels)  # R boxes
+        pooled = self.roi_pool(rois, self.levels(stages), grid)  # (R, 6 * 6 * 6 * 96)
+        refined = self.roi_head(pooled)
+        return VoxelRcnnPredictions(first, rois, refined, targets)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
         """Layers that work on whole maps; neighbourhood attention has kernels of its own, which nothing can compile."""
-        layers = [layer for stage in self.backbone.stages for layer in stage.children()]
-        return (*(layer for layer in layers if not isinstance(layer, NeighborhoodBlock)), *self.backbone.ups)
+        stages = [stage for stage in self.backbone.stages if isinstance(stage, AttentiveStage)]
+        layers = [layer for stage in stages for layer in (*stage.convolutions, *stage.further)]
+        attentions = [stage.ca for stage in stages if isinstance(stage.ca, CoordinateAttention)]
+        return (*layers, *attentions, *self.backbone.ups)
 
 
 def patch_cells(radius: float, cell: Sequence[float]) -> float:
@@ -239,8 +259,9 @@ def patch_cells(radius: float, cell: Sequence[float]) -> float:
     return math.pi * radius * radius / (cell[0] * cell[1])
 
 
-def normalised(count: Tensor, radius: float, cell: Sequence[float], how: Normalisation) -> Tensor:
+def normalised(count: Tensor, radius: float, cell: Sequence[float], how: Normalisation | str) -> Tensor:
     """Turn counts ``(V,)`` within a radius into float32 features ``(V,)``."""
+    how = chosen("how", how, Normalisation)
     count, full = count.float(), patch_cells(radius, cell)
     if how is Normalisation.LOG_SHARE:
         return torch.log1p(count) / math.log1p(full)
@@ -290,8 +311,8 @@ class DensityBranch(nn.Module):
         self,
         radii: Sequence[float] = (0.6, 1.8),
         depth: int = 16,
-        count_set: CountSet = CountSet.VOXELS,
-        normalisation: Normalisation = Normalisation.LOG_SHARE,
+        count_set: CountSet | str = CountSet.VOXELS,
+        normalisation: Normalisation | str = Normalisation.LOG_SHARE,
         max_count: int | None = None,
         own_points: int | None = None,
         collapse: bool = False,
@@ -313,8 +334,8 @@ class DensityBranch(nn.Module):
         if max_count is not None and max_count < 1:
             raise BeamboxError(f"`max_count` must be at least 1 (a voxel counts itself), or none; got {max_count}")
         self.radii = tuple(radii)
-        self.count_set = count_set
-        self.normalisation = normalisation
+        self.count_set = chosen("count_set", count_set, CountSet)
+        self.normalisation = chosen("normalisation", normalisation, Normalisation)
         self.max_count = max_count
         self.own_points = own_points
         self.depth = depth
@@ -346,7 +367,8 @@ class DensityBranch(nn.Module):
     def features(self, sites: Sites, voxels: Voxels) -> Tensor:
         """Return each voxel's densities ``(V, radii)``, and with ``own_points`` its own, in the order of ``sites``."""
         cell = voxels.grid.cell
-        columns = [normalised(self.counts(sites, voxels, r), r, cell, self.normalisation) for r in self.radii]
+        counts = self.counts(sites, voxels).unbind(dim=1)
+        columns = [normalised(count, r, cell, self.normalisation) for count, r in zip(counts, self.radii)]
         if self.own_points is not None:
             row = torch.searchsorted(sites.sorted_keys, linear_keys(voxels.index, sites.shape))
             own = torch.empty(len(sites), device=voxels.count.device)
@@ -355,40 +377,75 @@ class DensityBranch(nn.Module):
         return torch.stack(columns, dim=1)
 
     @torch.no_grad()
-    def counts(self, sites: Sites, voxels: Voxels, radius: float) -> Tensor:
-        """Return how many voxels or points lie within a radius of each voxel's centre, ``(V,)`` int64."""
+    def counts(self, sites: Sites, voxels: Voxels) -> Tensor:
+        """Return how many voxels or points lie within each radius of each voxel's centre, ``(V, R)`` int64."""
         if self.count_set is CountSet.VOXELS:
-            count = ball_count(sites.indices, voxels.grid.cell, radius)
+            extent = (sites.batch_size, *sites.shape)
+            count = ball_counts(sites.indices, voxels.grid.cell, self.radii, extent)
         else:
             centres = voxels.grid.centre(sites.indices[:, 1:])
-            of_point = voxels.index[voxels.voxel, 0]
-            count = count_points(centres, sites.indices[:, 0], voxels.points[:, :3], of_point, radius)
+            points, of_point, sample = voxels.points[:, :3], voxels.index[voxels.voxel, 0], sites.indices[:, 0]
+            count = [count_points(centres, sample, points, of_point, radius) for radius in self.radii]
+            count = torch.stack(count, dim=1)
         return count if self.max_count is None else count.clamp(max=self.max_count)
 
 
-class AttentiveBackbone(BevBackbone):
-    """Voxel R-CNN's 2-D network with both attentions in every stage (DenNet, section 3.3.2, figure 6).
-
-    ==========  ==================================================================================
-    stage       layers
-    ==========  ==================================================================================
-    1           6 convolutions 3 x 3 of 64 channels, NA of 64, CA of 64
-    2           6 convolutions 3 x 3 of 128 channels, the first of stride 2, NA of 128, CA of 128
-    3           both enlarged to 128 channels at the size of the first, joined
-    ==========  ==================================================================================
-    """
+class AttentiveBackbone(nn.Module):
+    """Voxel R-CNN's 2-D network with both attentions in every stage (DenNet, section 3.3.2, figure 6)."""
 
     def __init__(self, in_channels: int, config: DenNetConfig) -> None:
-        super().__init__(in_channels, config.depths, config.strides, config.widths, config.up_strides, config.up_widths)
-        for i, (width, heads) in enumerate(zip(config.widths, config.na_heads)):
-            layers = list(self.stages[i].children())
-            if config.na:
-                at = len(layers) // 2 if config.na_position is AttentionPosition.MIDDLE else len(layers)
-                block = NeighborhoodBlock(width, heads, config.na_window, config.na_mlp, config.na_ratio)
-                layers.insert(at, block)
-            if config.ca:
-                layers.append(CoordinateAttention(width, config.ca_reduction))
-            self.stages[i] = nn.Sequential(*layers)
+        super().__init__()
+        expect_levels_meet(config.strides, config.up_strides)
+        inputs = (in_channels, *config.widths[:-1])
+        self.stages = nn.ModuleList(AttentiveStage(inputs[i], config, i) for i in range(len(inputs)))
+        self.ups = nn.ModuleList(
+            deconv_bn_relu(width, up_width, up_stride, up_stride)
+            for width, up_width, up_stride in zip(config.widths, config.up_widths, config.up_strides)
+        )
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, 256, Y, X)``: stages downwards, all enlarged and joined."""
+        levels = []
+        for stage, up in zip(self.stages, self.ups):
+            bev = stage(bev)  # (B, 64, Y, X), then (B, 128, Y / 2, X / 2)
+            levels.append(up(bev))  # (B, 128, Y, X)
+        return join_levels(levels)
+
+
+class AttentiveStage(nn.Module):
+    """One stage of figure 6: six convolutions, neighbourhood attention, coordinate attention."""
+
+    def __init__(self, in_channels: int, config: DenNetConfig, stage: int) -> None:
+        super().__init__()
+        width, heads = config.widths[stage], config.na_heads[stage]
+        layers = [conv_bn_relu(in_channels, width, stride=config.strides[stage])]
+        layers += [conv_bn_relu(width, width) for _ in range(config.depths[stage])]
+        middle = config.na and config.na_position is AttentionPosition.MIDDLE
+        before = len(layers) // 2 if middle else len(layers)
+        self.convolutions = nn.Sequential(*layers[:before])
+        block = NeighborhoodBlock(width, heads, config.na_window, config.na_mlp, config.na_ratio) if config.na else None
+        self.na = block or nn.Identity()
+        self.further = nn.Sequential(*layers[before:])  # none, unless NA stands in the middle
+        self.ca = CoordinateAttention(width, config.ca_reduction) if config.ca else nn.Identity()
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """Map ``(B, in_channels, Y, X)`` to ``(B, C, Y / s, X / s)``."""
+        bev = self.convolutions(bev)  # (B, C, Y / s, X / s)
+        bev = self.na(bev)
+        bev = self.further(bev)
+        return self.ca(bev)
+
+
+def names_since(config: DenNetConfig) -> dict[str, str]:
+    """Return what the layers of a stage were called in 0.1.0, where a stage was a flat list, and are called now."""
+    names: dict[str, str] = {}
+    for i, depth in enumerate(config.depths):
+        middle = config.na and config.na_position is AttentionPosition.MIDDLE
+        before = (depth + 1) // 2 if middle else depth + 1
+        now = [f"convolutions.{k}" for k in range(before)] + ["na"] * config.na
+        now += [f"further.{k}" for k in range(depth + 1 - before)] + ["ca"] * config.ca
+        names |= {f"backbone.stages.{i}.{k}.": f"backbone.stages.{i}.{name}." for k, name in enumerate(now)}
+    return names
 
 
 class NeighborhoodAttention(nn.Module):

@@ -43,13 +43,14 @@ from enum import Enum
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError, expect_shape
+from beambox.checks import BeamboxError, choose_fields, chosen, expect_shape
 from beambox.detectors.contract import detections_from, targets_from
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import AnchorClass, AnchorGrid
-from beambox.layers.bev import BN_EPS, BN_MOMENTUM, conv_bn_relu, deconv_bn_relu
+from beambox.layers.bev import BN_EPS, BN_MOMENTUM, conv_bn_relu, deconv_bn_relu, join_levels
 from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss, select_boxes
 from beambox.layers.pillars import PillarFeatures
+from beambox.ops.dispatch import Backend, always, can_run_graph, choose
 from beambox.ops.scatter import scatter_bev
 from beambox.ops.voxelize import Voxels, voxelize
 from beambox.structures.batch import Batch
@@ -159,6 +160,7 @@ class HCNetConfig:
     """Post-processing at test time."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         if not self.anchors:
             raise BeamboxError("`anchors` must name at least one class, got none")
         of_stages = {"depths": self.depths, "strides": self.strides, "widths": self.widths, "up_widths": self.up_widths}
@@ -206,8 +208,13 @@ class HCNet(nn.Module):
         )
         self.head = AnchorHead(self.adapt.out_channels, self.anchors)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> AnchorPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> AnchorPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        ``labels`` are for networks with a second step; they change nothing here.
+        """
         return self.from_voxels(self.voxels(batch, self.config.grid if grid is None else grid))
 
     def from_voxels(self, voxels: Voxels) -> AnchorPredictions:
@@ -255,8 +262,11 @@ def pillar_stacks(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
         ``(M, N, C)`` features of each occupied pillar, slices from the lowest up, zero where a slice is empty; and
         ``(M, 4)`` int64 (sample, 0, y, x) of the pillars.
     """
-    if torch.compiler.is_exporting():
-        return one_stack_a_voxel(features, voxels)
+    return choose("pillar_stacks", STACK_BACKENDS, features)(features, voxels)
+
+
+def one_stack_a_pillar(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
+    """Do as :func:`pillar_stacks` says."""
     nx, ny, slices = voxels.grid.size
     sample, z, y, x = voxels.index.unbind(dim=1)
     distinct, pillar = ((sample * ny + y) * nx + x).unique(return_inverse=True)  # (M,), (V,)
@@ -285,6 +295,12 @@ def one_stack_a_voxel(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]
     return stacks, torch.stack((sample, torch.zeros_like(z), y, x), dim=1)
 
 
+STACK_BACKENDS = (
+    Backend("graph", can_run_graph, lambda: one_stack_a_voxel),
+    Backend("reference", always, lambda: one_stack_a_pillar),
+)
+
+
 def pseudo_images(features: Tensor, voxels: Voxels) -> Tensor:
     """Lay each height slice onto its own image, zero elsewhere (HCNet, section 3.2): ``(B, C, H, W, N)``.
 
@@ -310,10 +326,15 @@ class HeightChannelFusion(nn.Module):
     """
 
     def __init__(
-        self, channels: int, slices: int, kind: HeightChannelKind, height_hidden: int = 4, channel_hidden: int = 16
+        self,
+        channels: int,
+        slices: int,
+        kind: HeightChannelKind | str,
+        height_hidden: int = 4,
+        channel_hidden: int = 16,
     ) -> None:
         super().__init__()
-        self.kind = kind
+        self.kind = kind = chosen("kind", kind, HeightChannelKind)
         self.slices = slices
         uses_height = kind in (HeightChannelKind.HEIGHT, HeightChannelKind.BOTH)
         uses_channel = kind in (HeightChannelKind.CHANNEL, HeightChannelKind.BOTH)
@@ -352,8 +373,17 @@ class HeightChannelFusion(nn.Module):
 
 
 def two_pointwise(width: int, hidden: int) -> nn.Sequential:
-    """Two 1 x 1 convolutions with ReLU, on the last axis; the result is at least 0."""
-    return nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, width), nn.ReLU())
+    """Two 1 x 1 convolutions with ReLU, on the last axis; the result is at least 0.
+
+    The paper names no initialisation, and PyTorch's shuts a ReLU for good in every second network: inputs are not
+    negative, so a unit whose few weights and bias came out negative gives 0 and no gradient, whatever it sees. Both
+    start open here, hidden units by a bias of 0.5, results near 1: all slices and channels weigh sigmoid(1) = 0.73.
+    """
+    first, last = nn.Linear(width, hidden), nn.Linear(hidden, width)
+    nn.init.constant_(first.bias, 0.5)
+    nn.init.normal_(last.weight, std=0.05)
+    nn.init.ones_(last.bias)
+    return nn.Sequential(first, nn.ReLU(), last, nn.ReLU())
 
 
 class PyramidBackbone(nn.Module):
@@ -377,9 +407,9 @@ class PyramidBackbone(nn.Module):
         top1 = self.block1(image)  # (B, 64, Y / 2, X / 2)
         top2 = self.block2(top1)  # (B, 128, Y / 4, X / 4)
         top3 = self.block3(top2)  # (B, 256, Y / 8, X / 8)
-        down2 = join(top2, self.deblock3(top3))  # (B, 256, Y / 4, X / 4)
-        down1 = join(top1, self.deblock2(down2))  # (B, 128, Y / 2, X / 2)
-        return join(self.up1(down1), self.up2(down2), self.up3(top3))  # (B, 384, Y / 2, X / 2)
+        down2 = join_levels((top2, self.deblock3(top3)))  # (B, 256, Y / 4, X / 4)
+        down1 = join_levels((top1, self.deblock2(down2)))  # (B, 128, Y / 2, X / 2)
+        return join_levels((self.up1(down1), self.up2(down2), self.up3(top3)))  # (B, 384, Y / 2, X / 2)
 
 
 @dataclass(frozen=True)
@@ -405,7 +435,7 @@ class OriginalFusion(nn.Module):
 
     def forward(self, bev: Tensor, image: Tensor) -> Tensor:
         """Map ``(B, channels, Y / s, X / s)`` and the image ``(B, C, Y, X)`` to ``(B, out_channels, Y / s, X / s)``."""
-        return self.weigh(join(bev, self.shrink(image)))
+        return self.weigh(join_levels((bev, self.shrink(image))))
 
 
 class AdaptiveHead(nn.Module):
@@ -439,7 +469,7 @@ class AdaptiveHead(nn.Module):
         bev = bev if self.fuse1 is None else self.fuse1(bev, image)  # (B, 384 + 64, Y / 2, X / 2)
         deep = self.block(bev)  # (B, 128, Y / 4, X / 4)
         deep = deep if self.fuse2 is None else self.fuse2(deep, image)  # (B, 128 + 64, Y / 4, X / 4)
-        both = join(self.skip(bev), self.deblock(deep))  # (B, 256, Y / 2, X / 2)
+        both = join_levels((self.skip(bev), self.deblock(deep)))  # (B, 256, Y / 2, X / 2)
         return both if self.adjust is None else self.adjust(both)
 
 
@@ -474,11 +504,11 @@ class AdaptiveAdjustment(nn.Module):
     Rows and columns are averaged over the whole map, so the answer at a place depends on the region.
     """
 
-    def __init__(self, channels: int, gate: Gate = Gate.RELU, kernel: int = 3) -> None:
+    def __init__(self, channels: int, gate: Gate | str = Gate.RELU, kernel: int = 3) -> None:
         super().__init__()
         if kernel % 2 == 0:
             raise BeamboxError(f"`kernel` must be odd, so that rows and columns keep their number, got {kernel}")
-        self.gate = gate
+        self.gate = gate = chosen("gate", gate, Gate)
         self.rows = strip_conv(channels, (kernel, 1), gate)
         self.columns = strip_conv(channels, (1, kernel), gate)
 
@@ -510,12 +540,6 @@ def block(in_channels: int, width: int, depth: int, stride: int) -> nn.Sequentia
 def deblock(in_channels: int, width: int, stride: int) -> nn.Sequential:
     """A transposed 3 x 3 convolution that undoes a stride."""
     return deconv_bn_relu(in_channels, width, 3, stride, padding=1, output_padding=stride - 1)
-
-
-def join(first: Tensor, *others: Tensor) -> Tensor:
-    """Join maps along the channels, cut to the first one's size (an odd size halved and doubled is one larger)."""
-    height, width = first.shape[-2:]
-    return torch.cat([first, *(other[..., :height, :width] for other in others)], dim=1)
 
 
 def hcnet(config: HCNetConfig | None = None) -> HCNet:

@@ -53,11 +53,11 @@ class PointPillarsConfig:
     """Region in metres and pillar size (PointPillars, section 3.1: 0.16 m; range of the car network)."""
     max_points: int = 32
     """Points kept in a pillar, in scan order."""
-    max_pillars: int | None = 40000
+    max_voxels: int | None = 40000
     """Pillars kept in a sweep, in order of first appearance; None keeps all."""
     columns: int = 4
     """Values of a point: x, y, z, intensity, ..."""
-    pillar_channels: int = 64
+    voxel_channels: int = 64
     """Width of the pillar features."""
     absolute_xy: bool = True
     """Whether a point's absolute x and y are among its features."""
@@ -110,14 +110,19 @@ class PointPillars(nn.Module):
         self.config = config
         slots = config.max_points if config.empty_slots else None
         self.anchors = AnchorGrid(config.anchors, config.grid, config.strides[0], config.centred_anchors)
-        self.pillar_net = PillarFeatures(config.pillar_channels, config.columns, config.absolute_xy, slots)
+        self.pillar_net = PillarFeatures(config.voxel_channels, config.columns, config.absolute_xy, slots)
         self.backbone = BevBackbone(
-            config.pillar_channels, config.depths, config.strides, config.widths, config.up_strides, config.up_widths
+            config.voxel_channels, config.depths, config.strides, config.widths, config.up_strides, config.up_widths
         )
         self.head = AnchorHead(self.backbone.out_channels, self.anchors)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> AnchorPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> AnchorPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        ``labels`` are for networks with a second step; they change nothing here.
+        """
         return self.from_voxels(self.voxels(batch, self.config.grid if grid is None else grid))
 
     def from_voxels(self, pillars: Voxels) -> AnchorPredictions:
@@ -136,7 +141,7 @@ class PointPillars(nn.Module):
         """Gather points into pillars."""
         config = self.config
         points = batch.points[:, : config.columns]
-        return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_pillars)
+        return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
 
     @staticmethod
     def pseudo_image(features: Tensor, pillars: Voxels) -> Tensor:

@@ -125,8 +125,13 @@ class Second(nn.Module):
         )
         self.head = AnchorHead(self.backbone.out_channels, self.anchors)
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> AnchorPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> AnchorPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        ``labels`` are for networks with a second step; they change nothing here.
+        """
         grid = self.config.grid if grid is None else grid
         voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
         stages = self.encoder(voxels)

@@ -22,11 +22,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import torch
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, expect_same_length
-from beambox.detectors.contract import detections_from, targets_from
+from beambox.detectors.contract import detections_from, expect_made, targets_from
 from beambox.detectors.second import KITTI_VOXELS, ONCE_VOXELS, STRIDE
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass, AnchorGrid
@@ -37,6 +36,7 @@ from beambox.layers.roi import (
     ProposalLimits,
     Rois,
     RoiSampling,
+    RoiTargets,
     decode_rois,
     propose,
     roi_loss,
@@ -151,11 +151,11 @@ class VoxelRcnnPredictions:
     first: AnchorPredictions
     """The first stage's anchors."""
     rois: Rois
-    """Its proposals."""
-    levels: tuple[SparseTensor, ...]
-    """The sparse encoder's features, one for each level of the pooling."""
-    refined: RoiPredictions | None
-    """The second stage's view of the proposals; None in training, where the loss chooses the regions to look at."""
+    """What the second stage looked at: the first stage's best boxes or, given labels, those drawn to learn from."""
+    refined: RoiPredictions
+    """What it says of them."""
+    targets: RoiTargets | None
+    """What it is to learn of them; None without labels."""
 
 
 class TwoStage(nn.Module):
@@ -176,14 +176,23 @@ class TwoStage(nn.Module):
         )
         self.roi_head = RoiHead(self.roi_pool.out_channels, config.roi_width, config.dropout)
 
-    def detect(self, stages: EncoderStages, bev: Tensor, grid: VoxelGrid) -> VoxelRcnnPredictions:
-        """Predict anchors from the 2-D network's map, and, unless in training, refine the best ones."""
-        first = self.head(bev, grid)
-        rois = propose(first, self.config.train_proposals if self.training else self.config.test_proposals)
+    def regions(self, first: AnchorPredictions, labels: Sequence[Labels] | None) -> tuple[Rois, RoiTargets | None]:
+        """Choose what the second stage looks at; no gradient.
+
+        Without labels: the first stage's best boxes, and no targets. With labels: regions drawn from more of its boxes
+        as :class:`RoiSampling` says, by PyTorch's default source of randomness, and what they teach.
+        """
+        config = self.config
+        if labels is None:
+            return propose(first, config.test_proposals), None
+        boxes, classes = targets_from(labels, config.classes, first.cls.device)
+        targets = sample_rois(propose(first, config.train_proposals), boxes, classes, config.sampling)
+        return targets.rois, targets
+
+    def levels(self, stages: EncoderStages) -> list[SparseTensor]:
+        """Return the encoder's features that the second stage pools, one for each level of the pooling."""
         by_stride = {2: stages.stride2, 4: stages.stride4, 8: stages.stride8}
-        levels = tuple(by_stride[level.stride] for level in self.config.pooling)
-        refined = None if self.training else self.refine(rois, levels, grid)
-        return VoxelRcnnPredictions(first, rois, levels, refined)
+        return [by_stride[level.stride] for level in self.config.pooling]
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
@@ -196,33 +205,24 @@ class TwoStage(nn.Module):
         points = batch.points[:, : config.columns]
         return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
 
-    def refine(self, rois: Rois, levels: Sequence[SparseTensor], grid: VoxelGrid) -> RoiPredictions:
-        """Run the second stage on any regions."""
-        pooled = self.roi_pool(rois, levels, grid)  # (R, 6 * 6 * 6 * 96)
-        return self.roi_head(pooled)
-
-    def loss(
-        self, predictions: VoxelRcnnPredictions, labels: Sequence[Labels], generator: torch.Generator | None = None
-    ) -> dict[str, Tensor]:
+    def loss(self, predictions: VoxelRcnnPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
         """Return the first stage's weighted losses and the second's ``roi_cls``, ``roi_box`` and ``roi_corner``.
 
         Args:
-            predictions: of this network.
+            predictions: of this network, made with the same labels.
             labels: ground truth of each sample; objects of other classes are background.
-            generator: source of randomness for drawing regions; PyTorch's default one where None.
         """
-        first = predictions.first
+        expect_made(predictions.targets is not None, wanted=True)
+        assert predictions.targets is not None
+        first, refined = predictions.first, predictions.refined
         boxes, classes = targets_from(labels, self.config.classes, first.cls.device)
         losses = anchor_loss(first, boxes, classes, self.anchors, self.config.loss, self.config.smooth_l1_beta)
-        targets = sample_rois(predictions.rois, boxes, classes, self.config.sampling, generator)
-        refined = self.refine(targets.rois, predictions.levels, first.grid)
-        return {**losses, **roi_loss(refined.cls, refined.codes, targets)}
+        return {**losses, **roi_loss(refined.cls, refined.codes, predictions.targets)}
 
     def decode(self, predictions: VoxelRcnnPredictions) -> list[Detections]:
         """Return the detections of each sample, best first."""
+        expect_made(predictions.targets is not None, wanted=False)
         rois, refined = predictions.rois, predictions.refined
-        if refined is None:
-            refined = self.refine(rois, predictions.levels, predictions.first.grid)
         boxes = decode_rois(refined.codes.float(), rois.boxes)
         return detections_from(select_rois(rois, refined.cls, boxes, self.config.post), self.config.classes)
 
@@ -244,13 +244,22 @@ class VoxelRcnn(TwoStage):
             config.up_widths,
         )
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> VoxelRcnnPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> VoxelRcnnPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        With ``labels`` the second stage looks at regions drawn to learn from, without at the best proposals.
+        """
         grid = self.config.grid if grid is None else grid
         voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
         stages = self.encoder(voxels)
         bev = self.backbone(stages.bev)  # (B, 256, ny / 8, nx / 8)
-        return self.detect(stages, bev, grid)
+        first = self.head(bev, grid)
+        rois, targets = self.regions(first, labels)  # R boxes
+        pooled = self.roi_pool(rois, self.levels(stages), grid)  # (R, 6 * 6 * 6 * 96)
+        refined = self.roi_head(pooled)
+        return VoxelRcnnPredictions(first, rois, refined, targets)
 
 
 def voxel_rcnn(config: VoxelRcnnConfig | None = None) -> VoxelRcnn:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +16,14 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import build, config_to_dict, name_of
+from beambox.detectors.catalogue import build, config_to_dict, name_of, tensors_since
 from beambox.io import write_bytes
 
 __all__ = ["WeightFile", "load_weights", "read_weights", "save_weights"]
 
 FORMAT = "beambox-weights-1"
+
+log = logging.getLogger("beambox")
 
 
 @dataclass(frozen=True)
@@ -102,9 +106,17 @@ def load_weights(path: str | Path, device: torch.device | str = "cpu") -> nn.Mod
         BeamboxError: if the file cannot be read or its tensors do not fit its configuration.
     """
     stored = read_weights(path)
+    warn_of_licence(Path(path).stem, str(stored.card.get("licence", "")))
     model = build(stored.detector, stored.config)
     fill(model, stored.tensors, str(path))
     return model.to(device).eval()
+
+
+@functools.cache  # once a process
+def warn_of_licence(name: str, licence: str) -> None:
+    """Say that weights may not be used commercially, where their card does."""
+    if "-NC-" in licence.upper():
+        log.warning("the weights %s are not free for commercial use: %s", name, licence)
 
 
 def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
@@ -113,7 +125,7 @@ def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
     Raises:
         BeamboxError: naming the first tensor that is missing, unknown or of another shape.
     """
-    own = model.state_dict()
+    own, tensors = model.state_dict(), tensors_since(model, tensors)
     missing, unknown = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
     if missing or unknown:
         said = [f"lacks {missing[0]} and {len(missing) - 1} more"] if missing else []

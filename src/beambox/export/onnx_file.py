@@ -21,10 +21,10 @@ import torch
 from torch import Tensor, nn
 
 from beambox import __version__
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 from beambox.detectors.catalogue import config_to_dict, name_of
 from beambox.detectors.hcnet import HCNet
-from beambox.detectors.pointpillars import PointPillars, PointPillarsConfig
+from beambox.detectors.pointpillars import PointPillars
 from beambox.export.onnx_check import TOLERANCE, Differences, compare, runtime_is_there, synthetic_sweep
 from beambox.geometry.grid import VoxelGrid
 from beambox.io import write_bytes
@@ -35,7 +35,7 @@ __all__ = ["OPSETS", "DenseGraph", "Written", "export_onnx"]
 OPSETS = range(18, 24)
 """Versions of ONNX's operators that can be asked for; before 18 there is no maximum over groups."""
 FORMAT = "beambox-onnx-1"
-INSTALL = "pip install 'beambox[export]'"
+INSTALL = how_to_install("export")
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def described(detector: PointPillars | HCNet, grid: VoxelGrid, card: Mapping[str
         "grid": asdict(grid),
         "cells": list(grid.size),
         "max_points": config.max_points,
-        "max_voxels": config.max_pillars if isinstance(config, PointPillarsConfig) else config.max_voxels,
+        "max_voxels": config.max_voxels,
         "post": asdict(config.post),
         "config": config_to_dict(config),
         "card": dict(card),

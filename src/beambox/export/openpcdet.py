@@ -1,21 +1,25 @@
 """Checkpoints of OpenPCDet, read into this package's detectors.
 
-Only tensors are read (``torch.load(weights_only=True)``), never code. A checkpoint does not say what it was trained
-for, so its configuration is told from the number of classes its head has: 1 for KITTI's cars, 3 for KITTI, 5 for ONCE.
+Only tensors and NumPy's numbers are read (``torch.load(weights_only=True)``), never code. A checkpoint does not say
+what it was trained for, so its configuration is told from the number of classes its head has: 1 for KITTI's cars, 3 for
+KITTI, 5 for ONCE.
 """
 
 from __future__ import annotations
 
 import pickle
+import re
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.checks import BeamboxError, MissingFileError, did_you_mean, printable
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
 from beambox.detectors.second import KITTI_CAR, SecondConfig, second
 from beambox.detectors.second import ONCE as SECOND_ONCE
@@ -94,6 +98,8 @@ def head_names() -> Names:
     yield "head.direction", "dense_head.conv_dir_cls"
 
 
+DISTRIBUTED = "module."
+"""What stands before every name where a model was saved in its wrapper for several GPUs."""
 PASSED_OVER = ("global_step",)
 """Entries of a checkpoint that are no part of the network."""
 
@@ -108,7 +114,7 @@ def pointpillars_config(classes: int) -> PointPillarsConfig | None:
     return {
         1: replace(kitti, anchors=kitti.anchors[:1]),
         3: kitti,
-        5: replace(kitti, anchors=ONCE_ANCHORS, grid=once, max_points=20, max_pillars=60000),
+        5: replace(kitti, anchors=ONCE_ANCHORS, grid=once, max_points=20, max_voxels=60000),
     }.get(classes)
 
 
@@ -180,17 +186,41 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise MissingFileError(f"no checkpoint {path}; give a .pth file that OpenPCDet wrote")
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BeamboxError(
-            f"cannot read {path} as a checkpoint of tensors ({reason}); expected a whole .pth file that OpenPCDet wrote"
-        ) from error
+        with torch.serialization.safe_globals(_numpy_numbers()):
+            stored = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, TypeError, AttributeError,
+            IndexError, AssertionError, OverflowError, MemoryError, RecursionError, struct.error) as error:  # fmt: skip
+        raise BeamboxError(f"cannot read {path}: {_refusal(error)}") from None
     state = stored.get("model_state") if isinstance(stored, dict) else None
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         kind = f"the entries {sorted(map(str, stored))[:5]}" if isinstance(stored, dict) else type(stored).__name__
         raise BeamboxError(f'{path} must hold a dict "model_state" of tensors, as OpenPCDet writes it; got {kind}')
+    if state and all(str(name).startswith(DISTRIBUTED) for name in state):
+        state = {name.removeprefix(DISTRIBUTED): value for name, value in state.items()}
     return {name: value for name, value in state.items() if name not in PASSED_OVER}
+
+
+def _numpy_numbers() -> list[Any]:
+    """List what a pickle calls to make NumPy's numbers, by the names of NumPy 1 and 2; none of it runs other code.
+
+    Training with OpenPCDet puts such numbers into the state of the optimizer (learning rates are made by ``np.cos``).
+    """
+    scalar = np.float64(0).__reduce__()[0]
+    kinds = {type(np.dtype(code)) for code in "?bBhHiIlLqQefd"}
+    return [(scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype, *kinds]
+
+
+def _refusal(error: Exception) -> str:
+    """Say what is wrong with a checkpoint; torch's own words advise to run the code in it."""
+    text = str(error)
+    code = re.search(r"GLOBAL (\S+)|(?:class|function) ([\w.]+)", text)
+    if isinstance(error, pickle.UnpicklingError) and "weights" in text.lower() and code:
+        return (
+            f"it holds `{printable((code[1] or code[2])[:100])}`, a Python object that only running code from the file "
+            'would restore; keep the tensors alone, where it was trained: torch.save({"model_state": '
+            'checkpoint["model_state"]}, "tensors.pth")'
+        )
+    return "it is no whole checkpoint of PyTorch; expected a .pth file as OpenPCDet's training writes it"
 
 
 def _count_classes(state: Mapping[str, Tensor], path: str | Path) -> int:

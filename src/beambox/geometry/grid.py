@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError
+from beambox.geometry.constants import constant
 
 __all__ = ["VoxelGrid"]
+
+MOST_CELLS = 900_000_000
+"""Cells of a grid; indices of the sparse operations and a map's features would not fit beyond."""
+MOST_CELLS_OF_MAP = 40_000_000
+"""Cells seen from above: a region of 300 m in cells of 5 cm."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +36,21 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         for axis, low, high, step in zip("xyz", self.minimum, self.maximum, self.cell):
+            if not all(map(math.isfinite, (low, high, step))):
+                raise BeamboxError(f"a grid needs finite numbers, got {low} to {high} by {step} on {axis}")
             if not (high > low and step > 0):
                 raise BeamboxError(
                     f"a grid needs minimum < maximum and a positive cell on each axis, "
                     f"got {low} to {high} by {step} on {axis}"
                 )
+
+        cells = [max(1.0, (high - low) / step) for low, high, step in zip(self.minimum, self.maximum, self.cell)]
+        if cells[0] * cells[1] > MOST_CELLS_OF_MAP or math.prod(cells) > MOST_CELLS:
+            told = " x ".join(f"{count:.4g}" for count in cells)
+            raise BeamboxError(
+                f"a grid of {told} cells fits no memory (at most {MOST_CELLS_OF_MAP:.1g} in a map and {MOST_CELLS:.1g} "
+                "in all): take a smaller range or larger cells"
+            )
 
     @property
     def size(self) -> tuple[int, int, int]:
@@ -58,17 +75,17 @@ class VoxelGrid:
         Returns:
             ``(N, 3)`` int64 cell index (z, y, x), meaningless where outside, and ``(N,)`` bool, inside.
         """
-        minimum = points.new_tensor(self.minimum)
-        cell = points.new_tensor(self.cell)
-        size = torch.tensor(self.size, device=points.device)
+        minimum = constant(self.minimum, points.device, points.dtype)
+        cell = constant(self.cell, points.device, points.dtype)
+        size = constant(self.size, points.device)
         xyz = torch.floor((points[:, :3] - minimum) / cell)  # (N, 3)
         inside = ((xyz >= 0) & (xyz < size)).all(dim=1)  # NaN compares false, so it is outside
         return torch.where(inside[:, None], xyz, 0.0).long().flip(1), inside
 
     def centre(self, index: Tensor) -> Tensor:
         """Return the geometric centres (x, y, z) of cells given as ``(..., 3)`` (z, y, x): ``(..., 3)`` float32."""
-        cell = torch.tensor(self.cell, device=index.device)
-        minimum = torch.tensor(self.minimum, device=index.device)
+        cell = constant(self.cell, index.device)
+        minimum = constant(self.minimum, index.device)
         return (index.flip(-1) + 0.5) * cell + minimum
 
     def contains(self, centres: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beambox.data.placements import up_axis
 from beambox.data.reading import read_frame
 from beambox.data.road import fit_road_plane, height_and_slope
 from beambox.geometry.axes import Axes
@@ -75,7 +76,10 @@ def examine(path: Path | str, trained: Trained, fields: str | Sequence[str] | No
     findings = [Finding("reading", "note", note) for note in frame.notes]
     if not len(frame):
         return Diagnosis((*findings, Finding("points", "bad", "the sweep has no points")))
-    findings += [_units(frame.points)]
+    units = _units(frame.points)
+    findings += [units]
+    if units.level == "bad":  # what follows would measure metres that are none
+        return Diagnosis(tuple(findings))
     axes_finding, axes = _axes(frame.points)
     turned = Corrections(axes).apply(frame).points
     plane = fit_road_plane(turned)
@@ -95,9 +99,12 @@ def _units(points: Tensor) -> Finding:
     text = f"{len(points):,} points, 95% within {far:.4g} of the origin"
     if far > 1000:
         return Finding("points", "bad", f"{text}: metres around the sensor are expected; these look like millimetres "
-                       "or map coordinates. Divide, or subtract the sensor's position, first")  # fmt: skip
+                       "(divide them by 1000 first) or map coordinates (subtract the sensor's position first); nothing "
+                       "else was looked at")  # fmt: skip
     if far < 3:
-        return Finding("points", "bad", f"{text}: metres are expected; multiply first")
+        return Finding(
+            "points", "bad", f"{text}: metres are expected; multiply first (by 1000 if these are kilometres)"
+        )
     nothing = int((distance < 1e-6).sum())
     if nothing:
         text += f"; {nothing:,} lie exactly at the origin (laser pulses without an echo): harmless"
@@ -106,7 +113,7 @@ def _units(points: Tensor) -> Finding:
 
 def _axes(points: Tensor) -> tuple[Finding, Axes]:
     """Find which axis is up by the layer of the ground, and where the points lie if they do not lie all around."""
-    up = _up_axis(points)
+    up = up_axis(points)
     if up is not None:
         axes = _axes_from_up(up)
         text = f"the ground is a layer across the {up[-1]} axis and {up} is up, but the network takes +z for up"
@@ -122,26 +129,6 @@ def _axes(points: Tensor) -> tuple[Finding, Axes]:
     if quarter == 0:
         return Finding("axes", "good", text + ", ahead as expected"), axes
     return Finding("axes", "bad", text + ", but the network looks along +x", ("--axes", str(axes))), axes
-
-
-def _up_axis(points: Tensor) -> str | None:
-    """Return the axis that is up, such as "-y", or None where it is +z."""
-    xyz = points[:, :3].double().numpy()
-    xyz = xyz[np.abs(xyz).max(axis=1) < 50]
-    if len(xyz) < 500:
-        return None
-    spread = np.quantile(xyz, 0.95, axis=0) - np.quantile(xyz, 0.05, axis=0)
-    axis = int(spread.argmin())
-    if spread[axis] > 0.6 * np.sort(spread)[1]:
-        return None  # no axis is clearly the thin one
-    values = xyz[:, axis]
-    counts, edges = np.histogram(values, bins=np.arange(np.floor(values.min()), np.ceil(values.max()) + 0.1, 0.1))
-    ground = edges[counts.argmax()] + 0.05
-    # The ground is the densest layer, and what stands on it reaches farther than what lies below it.
-    above, below = np.quantile(values, 0.98) - ground, ground - np.quantile(values, 0.02)
-    sign = "+" if above >= below else "-"
-    found = sign + "xyz"[axis]
-    return None if found == "+z" else found
 
 
 def _axes_from_up(up: str) -> Axes:
@@ -213,7 +200,8 @@ def _range(given: Tensor, fixed: Tensor, trained: Trained) -> Finding:
     if then > inside + 0.05:
         text += f"; with the height put right {then:.0%}"
     if max(inside, then) < 0.02:
-        reach = max(20, 10 * round(float(given[:, :2].abs().quantile(0.9)) / 10)) if len(given) < 10**7 else 50
+        some = given[:: max(1, len(given) // 100_000), :2].abs()  # quantile takes no more than 16 million
+        reach = min(100, max(20, 10 * round(float(some.quantile(0.9)) / 10)))
         return Finding("range", "bad", text, ("--range", f"{reach}"))
     behind = float((given[:, 0] < low[0]).float().mean())
     if behind > 0.3:

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 import torch
 
 from beambox import __version__
+from beambox.checks import how_to_install
 from beambox.infer.doctor import Finding
 from beambox.infer.precision import bfloat16_reason
 from beambox.ops.dispatch import can_run_numba, can_run_triton, pinned
@@ -41,7 +42,7 @@ def environment() -> list[Finding]:
     findings += [_precision(torch.device("cuda" if torch.cuda.is_available() else "cpu"))]
     for what, package, extra in _OPTIONAL:
         if find_spec(package) is None:
-            text = f'cannot be read: {package} is not installed; pip install "beambox[{extra}]"'
+            text = f"cannot be read: {package} is not installed; {how_to_install(extra)}"
             findings.append(Finding(what, "note", text if extra != "train" else text.replace("be read", "be run")))
     names = ", ".join(shipped()) or "none in this installation"
     findings.append(Finding("weights", "good" if shipped() else "note", names))

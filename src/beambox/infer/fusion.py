@@ -17,10 +17,9 @@ def fold_batch_norms(model: nn.Module) -> nn.Module:
     norm's scale and shift into its weights; the norm becomes an identity, so that names of layers stay.
 
     Args:
-        model: in evaluation mode; it is not changed.
+        model: in any mode; neither it nor its mode is changed. The copy is in evaluation mode.
     """
-    assert not model.training, "batch statistics are only constant in evaluation mode"
-    folded = copy.deepcopy(model)
+    folded = copy.deepcopy(model).eval()  # batch statistics are only constant in evaluation mode
     for chain in folded.modules():
         if not isinstance(chain, nn.Sequential):
             continue

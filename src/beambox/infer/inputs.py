@@ -9,8 +9,9 @@ from pathlib import Path
 
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.formats.recording import ENDINGS, recording_of, sweeps_in
-from beambox.data.kitti import DEFAULT_IMAGE_SIZE, png_size, read_calibration, read_labels
+from beambox.data.kitti import DEFAULT_IMAGE_SIZE, image_boxes_told, png_size, read_calibration, read_labels
 from beambox.data.reading import SUFFIXES, read_frame
+from beambox.io import read_text
 from beambox.structures import Frame
 
 __all__ = ["Sweep", "calibration_beside", "find_sweeps", "read_sweep"]
@@ -108,11 +109,15 @@ def read_sweep(
     calibration = read_calibration(calib)
     folder, stem = sweep.path.parent.parent, sweep.path.stem
     image, label = folder / "image_2" / f"{stem}.png", folder / "label_2" / f"{stem}.txt"
+    camera = image.exists() or not label.exists() or image_boxes_told(read_text(label)) is not False
+    if not camera:  # labels made without a camera: no image to crop to
+        notes = "all image boxes are 0 (labels made without a camera): points are not cropped to a camera's view"
+        frame = replace(frame, notes=(*frame.notes, notes))
     return replace(
         frame,
         calibration=calibration,
         image_path=image if image.exists() else None,
-        image_size=png_size(image) if image.exists() else DEFAULT_IMAGE_SIZE,
+        image_size=png_size(image) if image.exists() else DEFAULT_IMAGE_SIZE if camera else None,
         labels=read_labels(label, calibration) if labels and label.exists() else None,
     )
 

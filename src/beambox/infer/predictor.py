@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, overload
@@ -14,14 +14,17 @@ import torch
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.data.formats.kept import close_kept
 from beambox.data.reading import points_from_array
 from beambox.detectors.weights import load_weights, read_weights
 from beambox.geometry import VoxelGrid
 from beambox.geometry.axes import Axes
 from beambox.infer.corrections import Corrections
+from beambox.infer.forking import survive_fork
 from beambox.infer.fusion import fold_batch_norms
 from beambox.infer.inputs import Sweep, read_sweep
 from beambox.infer.precision import choose_device, choose_precision
+from beambox.infer.streaming import Input, each_input, groups, names_one_sweep
 from beambox.infer.trained import Trained
 from beambox.structures import Batch, Detections, Frame
 from beambox.zoo import shipped
@@ -30,7 +33,6 @@ __all__ = ["Detector", "Input", "View", "find_weights", "load", "region"]
 
 log = logging.getLogger("beambox")
 
-Input = str | Path | np.ndarray | Tensor | Frame
 View = Literal["auto", "camera", "full"]
 VIEWS = ("auto", "camera", "full")
 
@@ -58,7 +60,7 @@ class Detector:
         """Prepare a model: batch norms folded, channels last, on its device.
 
         Args:
-            model: a detector of the catalogue; it is copied, not changed.
+            model: a detector of the catalogue; it is copied, and neither it nor its mode is changed.
             card: what is known of its weights.
             device: "cpu", "cuda", ...; None takes the GPU where there is one.
             precision: "auto", "float32", "bfloat16" or "float16".
@@ -82,7 +84,8 @@ class Detector:
         self.intensity_scale = intensity_scale
         self.fields = fields
         self.batch_size = batch_size
-        folded = fold_batch_norms(model.eval()).to(self.device)
+        survive_fork()
+        folded = fold_batch_norms(model).to(self.device)
         self.model: Any = channels_last(folded)
 
     @property
@@ -91,28 +94,47 @@ class Detector:
         return self.config.classes
 
     @overload
-    def __call__(self, given: Input) -> Detections: ...
+    def __call__(self, given: np.ndarray | Tensor | Frame) -> Detections: ...
     @overload
-    def __call__(self, given: Sequence[Input]) -> list[Detections]: ...
-    def __call__(self, given: Input | Sequence[Input]) -> Detections | list[Detections]:
+    def __call__(self, given: str | Path) -> Detections | Any: ...  # a list for a folder, a pattern or a recording
+    @overload
+    def __call__(self, given: Iterable[Input]) -> list[Detections]: ...
+    def __call__(self, given: Input | Iterable[Input]) -> Detections | list[Detections]:
         """Detect.
 
         Args:
             given: a path; an ``(N, 4 or more)`` array or tensor of x, y, z in metres (x forward, y left, z up) and
-                intensity in [0, 1]; a :class:`Frame`; or a list of these.
+                intensity in [0, 1]; a :class:`Frame`; or several sweeps: a list or generator of these, a folder, a
+                pattern such as ``"drive/*.pcd"``, a recording of ROS.
 
         Returns:
-            The detections, best first, on the CPU, in the frame of the points as given; a list for a list.
+            The detections, best first, on the CPU, in the frame of the points as given; a list for several sweeps.
 
         Raises:
             BeamboxError: if something cannot be read or is no point cloud.
         """
-        if isinstance(given, list | tuple):
-            found: list[Detections] = []
-            for start in range(0, len(given), self.batch_size):
-                found += self.detect([self.read(one) for one in given[start : start + self.batch_size]])
-            return found
-        return self.detect([self.read(given)])[0]  # pyright: ignore[reportArgumentType]
+        if names_one_sweep(given):
+            return self.detect([self.read(given)])[0]  # pyright: ignore[reportArgumentType]
+        return list(self.stream(given))
+
+    def stream(self, given: Input | Iterable[Input]) -> Iterator[Detections]:
+        """Detect and yield as it goes: one sweep (or ``batch_size`` of them) is in memory at a time.
+
+        Args:
+            given: as for a call; each sweep of a folder, pattern, recording, list or generator in turn. A recording
+                is opened once.
+
+        Yields:
+            The detections of each sweep, in order.
+
+        Raises:
+            BeamboxError: when a sweep cannot be read.
+        """
+        try:
+            for frames in groups(each_input(given), self.read, self.batch_size):
+                yield from self.detect(frames)
+        finally:
+            close_kept()
 
     def read(self, given: Input | Sweep) -> Frame:
         """Turn any input into a frame; nothing is corrected yet."""
@@ -129,10 +151,7 @@ class Detector:
             brighter[:, 3] *= scale
             return given.with_points(brighter)
         else:
-            raise BeamboxError(
-                "a detector takes a path, an (N, 4) array or tensor, a Frame, or a list of these; "
-                f"got {type(given).__name__}"
-            )
+            raise BeamboxError(f"a sweep is a path, an (N, 4) array or tensor, or a Frame; got {type(given).__name__}")
         for note in frame.notes:
             log.info("%s: %s", frame.id or "array", note)
         return frame
@@ -166,6 +185,7 @@ class Detector:
     @torch.inference_mode()
     def detect(self, frames: Sequence[Frame]) -> list[Detections]:
         """Detect in frames that pass through the network together; where there is no point, there is nothing."""
+        survive_fork()
         prepared = [self.prepare(frame) for frame in frames]
         seen = [k for k, frame in enumerate(prepared) if self.sees(frame)]
         found = [Detections.empty(self.classes, frame.id) for frame in frames]
@@ -178,6 +198,7 @@ class Detector:
     @torch.inference_mode()
     def predict(self, batch: Batch) -> Any:
         """Run the network on a prepared batch that lies on its device."""
+        survive_fork()
         lower = self.dtype != torch.float32
         with torch.autocast(self.device.type, dtype=self.dtype if lower else torch.bfloat16, enabled=lower):
             return self.model(batch, self.grid)
@@ -299,6 +320,7 @@ def load(
     Raises:
         BeamboxError: if there are no such weights, the file is broken, or an option cannot be used.
     """
+    survive_fork()
     path = find_weights(name)
     chosen = choose_device(device)
     model: Any = load_weights(path, "cpu")

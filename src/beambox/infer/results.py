@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import torch
-
-from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.kitti import read_results
 from beambox.io import read_text, write_text
 from beambox.structures import Detections, Frame
 
-__all__ = ["FORMATS", "choose_formats", "find_result", "format_csv", "format_json", "read_result", "write_results"]
+__all__ = ["FORMATS", "choose_formats", "find_result", "read_result", "write_results"]
 
 FORMATS = {"json": ".json", "csv": ".csv", "kitti": ".txt"}
 """Name of each format and the ending of its files."""
-COLUMNS = ("frame", "name", "score", "x", "y", "z", "l", "w", "h", "yaw")
 
 
 def choose_formats(words: str) -> list[str]:
@@ -36,23 +30,6 @@ def choose_formats(words: str) -> list[str]:
     if not chosen:
         raise BeamboxError(f"name at least one format of {', '.join(FORMATS)}")
     return list(dict.fromkeys(chosen))
-
-
-def format_json(detections: Detections, model: str) -> str:
-    """Write detections as JSON: who found them, and one object each; metres and radians, in the sweep's own frame."""
-    rows = [{key: row[key] for key in COLUMNS[1:]} for row in _rounded(detections)]
-    head = {"frame": detections.frame_id, "model": model, "beambox": __version__, "classes": list(detections.classes)}
-    objects = ",\n".join("    " + json.dumps(row) for row in rows)
-    return json.dumps(head, indent=2)[:-2] + ',\n  "detections": [' + (f"\n{objects}\n  " if rows else "") + "]\n}\n"
-
-
-def format_csv(detections: Detections) -> str:
-    """Write detections as CSV with a header line; the columns are those of the JSON's objects and the frame."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows([row[key] for key in COLUMNS] for row in _rounded(detections))
-    return text.getvalue()
 
 
 def write_results(
@@ -76,7 +53,7 @@ def write_results(
         if kind == "kitti":
             text = kitti_text(frame, detections)
         else:
-            text = format_json(detections, model) if kind == "json" else format_csv(detections)
+            text = detections.to_json(model) if kind == "json" else detections.to_csv()
         path = folder / f"{name or frame.id}{FORMATS[kind]}"
         write_text(path, text)
         written.append(path)
@@ -115,30 +92,7 @@ def read_result(path: Path, frame: Frame) -> Detections:
     text = read_text(path)
     try:
         if path.suffix == ".csv":
-            rows = list(csv.DictReader(io.StringIO(text)))
-            classes = tuple(dict.fromkeys(row["name"] for row in rows))
-        else:
-            content = json.loads(text)
-            rows, classes = content["detections"], tuple(content["classes"])
-        boxes = [[float(row[key]) for key in COLUMNS[3:]] for row in rows]
-        scores = [float(row["score"]) for row in rows]
-        labels = [classes.index(row["name"]) for row in rows]
-    except (KeyError, TypeError, ValueError) as error:
-        raise BeamboxError(
-            f"{path} must hold detections as `beambox detect` writes them, but does not: {error}"
-        ) from None
-    return Detections(
-        torch.tensor(boxes, dtype=torch.float32).reshape(-1, 7),
-        torch.tensor(scores, dtype=torch.float32),
-        torch.tensor(labels, dtype=torch.int64),
-        classes,
-        frame.id,
-    )
-
-
-def _rounded(detections: Detections) -> list[dict[str, float | str]]:
-    """Rows with a tenth of a millimetre and of a milliradian: what is beyond is noise."""
-    return [
-        {key: round(value, 4) if isinstance(value, float) else value for key, value in row.items()}
-        for row in detections.to_rows()
-    ]
+            return Detections.from_csv(text, path.name, frame.id)
+        return replace(Detections.from_json(text, path.name), frame_id=frame.id)
+    except BeamboxError as error:
+        raise BeamboxError(f"{path} must hold detections as `beambox detect` writes them; {error}") from None

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, expect_same_length
 
-__all__ = ["BevBackbone", "MapBlock", "conv_bn_relu", "deconv_bn_relu"]
+__all__ = ["BevBackbone", "MapBlock", "conv_bn_relu", "deconv_bn_relu", "expect_levels_meet", "join_levels"]
 
 BN_EPS = 1e-3
 BN_MOMENTUM = 0.01
@@ -72,12 +72,7 @@ class BevBackbone(nn.Module):
             up_strides=len(up_strides),
             up_widths=len(up_widths),
         )
-        needed = [math.prod(strides[1 : stage + 1]) for stage in range(len(strides))]
-        if list(up_strides) != needed:
-            raise BeamboxError(
-                f"`up_strides` must bring every stage back to the size of the first: with strides {list(strides)} they "
-                f"are {needed}, got {list(up_strides)}"
-            )
+        expect_levels_meet(strides, up_strides)
         self.stages = nn.ModuleList()
         self.ups = nn.ModuleList()
         for depth, stride, width, up_stride, up_width in zip(depths, strides, widths, up_strides, up_widths):
@@ -90,9 +85,28 @@ class BevBackbone(nn.Module):
 
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, out_channels, Y / s, X / s)``, s the first stage's net stride."""
-        joined = []
+        levels = []
         for stage, up in zip(self.stages, self.ups):
             bev = stage(bev)
-            joined.append(up(bev))
-        height, width = joined[0].shape[-2:]
-        return torch.cat([level[..., :height, :width] for level in joined], dim=1)
+            levels.append(up(bev))
+        return join_levels(levels)
+
+
+def expect_levels_meet(strides: Sequence[int], up_strides: Sequence[int]) -> None:
+    """Check that every stage comes back to the size of the first.
+
+    Raises:
+        BeamboxError: naming the enlargements that do.
+    """
+    needed = [math.prod(strides[1 : stage + 1]) for stage in range(len(strides))]
+    if list(up_strides) != needed:
+        raise BeamboxError(
+            f"`up_strides` must bring every stage back to the size of the first: with strides {list(strides)} they "
+            f"are {needed}, got {list(up_strides)}"
+        )
+
+
+def join_levels(levels: Sequence[Tensor]) -> Tensor:
+    """Join maps along the channels, cut to the first one's size (an odd size halved and doubled is one larger)."""
+    height, width = levels[0].shape[-2:]
+    return torch.cat([level[..., :height, :width] for level in levels], dim=1)

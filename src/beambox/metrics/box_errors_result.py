@@ -13,7 +13,7 @@ BANDS = (("overall", 0.0, math.inf), ("0-20m", 0.0, 20.0), ("20-40m", 20.0, 40.0
 """Name and limits of each band: distance of the labelled centre from the sensor over the ground, metres."""
 COLUMNS = ("x", "y", "z", "range", "along", "across", "length", "width", "height", "heading")
 """Signed errors: x, y, z of the sensor's frame; ``range``, away from the sensor over the ground; ``along`` and
-``across``, forward and left in the labelled box's own frame (its z is the sensor's); sizes; heading, modulo half a turn."""
+``across``, forward and left in the labelled box's own frame (its z is the sensor's); sizes; heading, modulo pi."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,14 @@ class BoxErrors:
         """Return the numbers of each class."""
         return {one.name: one.to_json() for one in self.classes}
 
+    def __str__(self) -> str:
+        """Return the numbers as text, as :meth:`table` does."""
+        return self.table()
+
     def table(self) -> str:
         """Return the numbers as text: centimetres and degrees, mean and spread."""
         lines = [
-            "errors of the matched boxes (BEV IoU > 0.25), detected - labelled: mean +- spread in cm, heading in degrees",
+            "errors of matched boxes (BEV IoU > 0.25), detected - labelled: mean +- spread in cm, heading in degrees",
             "range: away from the sensor; along, across: forward and left in the object's own frame",
         ]
         for one in self.classes:

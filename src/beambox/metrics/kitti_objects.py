@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.geometry.calibration import Calibration, CameraBoxes
+from beambox.io import read_names, read_text
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
@@ -190,10 +192,14 @@ def _folder(folder: Path, inner: Sequence[str], what: str) -> Path:
 
 
 def read_frame_list(path: Path) -> list[str]:
-    """Read frame names, one a line, as ImageSets/val.txt has them."""
+    """Read frame names, one a line, as ImageSets/val.txt has them.
+
+    Raises:
+        BeamboxError: if the list is not there, empty, or names a frame twice.
+    """
     if not path.is_file():
         raise MissingFileError(f"the list of frames {path} does not exist; it holds one frame name a line")
-    return path.read_text(encoding="utf-8").split()
+    return read_names(path)
 
 
 def read_pairs(
@@ -216,6 +222,9 @@ def read_pairs(
     names = sorted(path.stem for path in labels.glob("*.txt")) if frames is None else list(frames)
     if not names:
         raise BeamboxError(f"there is nothing to score: {labels} holds no label file <frame>.txt")
+    repeated = next((name for name, count in Counter(names).items() if count > 1), None)
+    if repeated is not None:
+        raise BeamboxError(f"the frames to score must be named once each, but {repeated} is named again")
     have = {path.stem for path in results.glob("*.txt")}
     missing = [name for name in names if name not in have]
     if missing and not allow_missing:
@@ -230,10 +239,10 @@ def read_pairs(
         if not label.is_file():
             raise MissingFileError(f"frame {name} has no label file {label}")
         result = results / f"{name}.txt"
-        found = result.read_text(encoding="utf-8") if name in have else ""
+        found = read_text(result) if name in have else ""
         pairs.append(
             (
-                parse_objects(label.read_text(encoding="utf-8"), str(label), scored=False),
+                parse_objects(read_text(label), str(label), scored=False),
                 parse_objects(found, str(result), scored=True),
             )
         )

@@ -13,10 +13,10 @@ The algorithm is that of the official devkit (ONCE_Benchmark, CPU evaluation), i
 
 from __future__ import annotations
 
-import json
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.geometry.boxes import wrap_angle
+from beambox.io import read_json
 from beambox.metrics.matching import MatchTable, count, sampled_precision, true_positive_scores
 from beambox.metrics.once_result import OnceResult
 from beambox.metrics.overlap import rotated_overlaps, starts
@@ -108,6 +109,7 @@ def evaluate_annotations(
     five_classes: bool = False,
     min_overlap: Mapping[str, float] | None = None,
     true_rotation: bool = False,
+    known: Collection[str] | None = None,
 ) -> OnceResult:
     """Score a file of annotations and predictions.
 
@@ -118,6 +120,7 @@ def evaluate_annotations(
         five_classes: as for :func:`evaluate`.
         min_overlap: as for :func:`evaluate`.
         true_rotation: as for :func:`evaluate`.
+        known: as for :func:`evaluate`.
 
     Raises:
         BeamboxError: naming the file and the key that cannot be used.
@@ -129,13 +132,17 @@ def evaluate_annotations(
         if results is None
         else _entries(_read(results), "predictions", results)
     )
-    found_by_id = {_frame_id(entry): entry for entry in founds}
-    known = {_frame_id(entry) for entry in truths}
-    missing = [name for name in known if name not in found_by_id]
     source = annotations if results is None else results
+    found_by_id = {_frame_id(entry): entry for entry in founds}
+    annotated = [_frame_id(entry) for entry in truths]
+    for where, names in ((annotations, annotated), (source, [_frame_id(entry) for entry in founds])):
+        repeated = next((name for name, count in Counter(names).items() if count > 1), None)
+        if repeated is not None:
+            raise BeamboxError(f"{where} must hold each frame once, but holds {repeated} again")
+    missing = [name for name in annotated if name not in found_by_id]
     if missing:
         raise BeamboxError(
-            f"{source}: {len(missing)} of {len(known)} annotated frames have no predictions, the first is "
+            f"{source}: {len(missing)} of {len(annotated)} annotated frames have no predictions, the first is "
             f"{min(missing)}; write an entry with empty lists where nothing was found"
         )
     pairs = []
@@ -143,7 +150,9 @@ def evaluate_annotations(
         name = _frame_id(entry)
         truth = _boxes(entry, f"{annotations}, ground truth of frame {name}", scored=False)
         pairs.append((truth, _boxes(found_by_id[name], f"{source}, predictions of frame {name}", scored=True)))
-    return evaluate_boxes(pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation)
+    return evaluate_boxes(
+        pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation, known=known
+    )
 
 
 def evaluate_boxes(
@@ -160,12 +169,14 @@ def evaluate_boxes(
     minima = _thresholds(FIVE_CLASSES if five_classes else SUPERCLASSES, min_overlap or {})
     merge = {} if five_classes else SUPERCLASS_OF
     all_classes = len(minima)
+    pairs, unknown = _with_known_names(pairs)
     if known is not None:
-        learned = {merge.get(name, name) for name in known}
+        learned = {merge.get(name, name) for name in (_KNOWN_NAMES.get(each.lower(), each) for each in known)}
         minima = {name: minimum for name, minimum in minima.items() if name in learned}
         if not minima:
+            all_names = dict.fromkeys((*SUPERCLASSES, *FIVE_CLASSES))
             raise BeamboxError(
-                f"ONCE's metric scores {', '.join(FIVE_CLASSES)}; the detector knows {', '.join(known) or 'no class'}"
+                f"ONCE's metric scores {', '.join(all_names)}; the detector knows {', '.join(known) or 'no class'}"
             )
     truth_name = np.array([merge.get(name, name) for truth, _ in pairs for name in truth.names], dtype=np.str_)
     found_name = np.array([merge.get(name, name) for _, found in pairs for name in found.names], dtype=np.str_)
@@ -199,7 +210,31 @@ def evaluate_boxes(
         values.append(tuple(_average_precision(table) for table in tables))
         objects.append(tuple(table.objects for table in tables))
     whole = len(minima) == all_classes
-    return OnceResult(tuple(minima), tuple(minima.values()), tuple(values), tuple(objects), len(pairs), whole)
+    return OnceResult(tuple(minima), tuple(minima.values()), tuple(values), tuple(objects), len(pairs), whole, unknown)
+
+
+_KNOWN_NAMES = {name.lower(): name for name in (*FIVE_CLASSES, *SUPERCLASSES)}
+ELSEWHERE = {"bicycle": "Cyclist", "motorcycle": "Cyclist", "person": "Pedestrian", "van": "Car"}
+"""Names that other data sets and toolboxes have for ONCE's classes."""
+
+
+def _with_known_names(
+    pairs: Sequence[tuple[OnceBoxes, OnceBoxes]],
+) -> tuple[list[tuple[OnceBoxes, OnceBoxes]], tuple[str, ...]]:
+    """Write names as ONCE does, whatever their case; the second value tells of names that it does not have."""
+    unknown: Counter[str] = Counter(
+        name for pair in pairs for side in pair for name in side.names if name.lower() not in _KNOWN_NAMES
+    )
+    told = []
+    for name, boxes in unknown.most_common():
+        meant = ELSEWHERE.get(name.lower())
+        hint = f' (did you mean "{meant}"?)' if meant else did_you_mean(name, FIVE_CLASSES)
+        told.append(f"{name}, {boxes} boxes{hint}")
+
+    def named(side: OnceBoxes) -> OnceBoxes:
+        return replace(side, names=tuple(_KNOWN_NAMES.get(name.lower(), name) for name in side.names))
+
+    return [(named(truth), named(found)) for truth, found in pairs], tuple(told)
 
 
 def gated_overlap(truth: Floats, found: Floats, true_rotation: bool = False) -> Floats:
@@ -271,10 +306,7 @@ def _thresholds(classes: Mapping[str, float], given: Mapping[str, float]) -> dic
 def _read(path: Path) -> Any:
     if not path.is_file():
         raise MissingFileError(f"{path} does not exist; it holds ONCE annotations as JSON")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise BeamboxError(f"{path} is not valid JSON: {error}") from error
+    return read_json(path)
 
 
 def _entries(content: Any, key: str, path: Path) -> list[dict[str, Any]]:
@@ -289,20 +321,31 @@ def _entries(content: Any, key: str, path: Path) -> list[dict[str, Any]]:
 
 
 def _frame_id(entry: Mapping[str, Any]) -> str:
-    return str(entry["frame_id"])
+    return str(entry["frame_id"])[:100]
 
 
 def _boxes(entry: Mapping[str, Any], where: str, scored: bool) -> OnceBoxes:
     entry = entry.get("annos", entry)
+    if not isinstance(entry, dict):
+        raise BeamboxError(f"{where}: expected names and boxes_3d, got {type(entry).__name__}")
     for key in ("names", "boxes_3d", *(("scores",) if scored else ())):
         if key not in entry and not (key == "scores" and "score" in entry) and not (key == "names" and "name" in entry):
             raise BeamboxError(f"{where}: the key {key!r} is missing{did_you_mean(key, entry)}")
-    names = tuple(map(str, entry.get("names", entry.get("name"))))
+    names = entry.get("names", entry.get("name"))
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BeamboxError(f"{where}: names must be a list of texts, got {str(names)[:60]}")
+    names = tuple(names)
     try:
-        boxes = np.array(entry["boxes_3d"], dtype=np.float64).reshape(-1, 7)
+        boxes = np.array(entry["boxes_3d"], dtype=np.float64)
+        boxes = boxes.reshape(0, 7) if boxes.size == 0 else boxes
+        if boxes.ndim != 2 or boxes.shape[1] != 7:
+            raise ValueError(f"got an array of shape {boxes.shape}")
         scores = np.array(entry.get("scores", entry.get("score")) if scored else [0.0] * len(names), dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BeamboxError(f"{where}: boxes_3d must be rows of x y z l w h yaw and scores numbers, {error}") from error
+        if scores.ndim != 1:
+            raise ValueError(f"got scores of shape {scores.shape}")
+    except (TypeError, ValueError, OverflowError) as error:
+        told = str(error)[:120]
+        raise BeamboxError(f"{where}: boxes_3d must be rows of x y z l w h yaw and scores numbers, {told}") from None
     if not len(names) == len(boxes) == len(scores):
         told = f"{len(names)} names, {len(boxes)} boxes_3d" + (f", {len(scores)} scores" if scored else "")
         raise BeamboxError(f"{where}: lists must have one length, got {told}")

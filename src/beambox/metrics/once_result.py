@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from beambox.structures.rows import frame_of_rows
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = ["BANDS", "PUBLISHED", "OnceResult", "PublishedRow"]
 
@@ -27,6 +32,8 @@ class OnceResult:
     """Number of frames scored."""
     whole: bool = True
     """Whether all the benchmark's classes were scored, so that the mean is its mAP."""
+    unknown: tuple[str, ...] = ()
+    """Names, with what to do, of boxes left out because ONCE has no such class."""
 
     def mean(self) -> tuple[float, ...]:
         """Return the plain mean over the classes scored, one value a band; of all classes the first is the mAP."""
@@ -34,8 +41,28 @@ class OnceResult:
 
     def to_json(self) -> dict[str, dict[str, float]]:
         """Return numbers ready for ``json.dump``, in percent; the mean only where it is that of all classes."""
-        rows = [*zip(self.classes, self.ap), *([("mean", self.mean())] if self.whole else [])]
-        return {name: dict(zip(BANDS, (round(value, 4) for value in row))) for name, row in rows}
+
+        def bands(row: Sequence[float]) -> dict[str, float]:
+            return dict(zip(BANDS, (round(value, 4) for value in row)))
+
+        entries = {name: {"iou": iou, **bands(row)} for name, iou, row in zip(self.classes, self.iou, self.ap)}
+        return {**entries, "mean": bands(self.mean())} if self.whole else entries
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Return one flat record per class and band of distance: AP in percent."""
+        return [
+            {"class": name, "iou": iou, "band": band, "objects": count, "AP": value}
+            for name, iou, counts, row in zip(self.classes, self.iou, self.objects, self.ap)
+            for band, count, value in zip(BANDS, counts, row)
+        ]
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the records of :meth:`to_rows` as a table (needs pandas)."""
+        return frame_of_rows(self.to_rows(), ("class", "iou", "band", "objects", "AP"))
+
+    def __str__(self) -> str:
+        """Return the numbers as text, as :meth:`table` does."""
+        return self.table()
 
     def table(self, name: str = "this result", published: bool = False) -> str:
         """Return the numbers as text, in the layout of DenNet's Table 3.
@@ -60,6 +87,8 @@ class OnceResult:
         ]
         if empty:
             lines += ["", f"no objects, scored 0 by the official rule: {', '.join(empty)}"]
+        if self.unknown:
+            lines += ["", f"left out, ONCE has no such class: {'; '.join(self.unknown)}"]
         if published and len(self.classes) == 3:
             lines += [
                 "",

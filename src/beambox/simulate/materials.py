@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["AIR", "BARK", "DARK", "GLASS", "LEAVES", "LIGHT", "METAL", "PANE", "RETRO", "RIM", "SKIN", "TYRE",
+__all__ = ["AIR", "BARK", "DARK", "GLASS", "INSIDE", "LEAVES", "LIGHT", "METAL", "PANE", "RETRO", "RIM", "SKIN", "TYRE",
            "Palette"]  # fmt: skip
 
 # Fixed rows of every palette; the first four are the ground's surfaces in the order of ground.ROAD ... MARKING.
-AIR, GLASS, PANE, DARK, TYRE, RIM, RETRO, LIGHT, LEAVES, BARK, METAL, SKIN = range(4, 16)
+AIR, GLASS, PANE, DARK, TYRE, RIM, RETRO, LIGHT, LEAVES, BARK, METAL, SKIN, INSIDE = range(4, 17)
 
 
 class Palette:
@@ -28,17 +28,26 @@ class Palette:
             (rng.uniform(0.28, 0.45), 0.03, 0.10, 1.6, 0.45, 0.0, 0.0),
             (rng.uniform(0.45, 0.75), 0.05, 0.10, 3.0, 0.50, 0.0, 0.0),
             (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0),  # AIR
-            (0.02, 2.0, 0.03, 0.5, 1.0, rng.uniform(0.80, 0.93), 0.3),  # GLASS of cars
+            (0.02, 2.0, 0.03, 0.3, 2.5, rng.uniform(0.90, 0.98), 0.3),  # GLASS of cars: a mirror unless met squarely
             (0.03, 2.0, 0.10, 0.12, 2.0, 0.0, 0.5),  # PANE: a house's or tram's window, mostly lost
             (0.03, 0.5, 0.04, 0.7, 0.5, 0.0, 0.0),  # DARK: seats, underbody
             (0.06, 0.5, 0.05, 0.6, 0.5, 0.0, 0.0),  # TYRE
             (0.30, 1.0, 0.20, 1.5, 0.5, 0.0, 0.3),  # RIM
-            (0.90, 0.1, 0.15, 8.0, 0.1, 0.0, 0.0),  # RETRO: plates and signs
-            (0.45, 0.5, 0.25, 3.0, 0.3, 0.0, 0.0),  # LIGHT: lamps
+            (
+                3.00,
+                0.1,
+                0.15,
+                8.0,
+                0.1,
+                0.0,
+                0.0,
+            ),  # RETRO: plates and signs; beyond what the sensor can tell, also from afar
+            (0.80, 0.5, 0.30, 3.0, 0.3, 0.0, 0.0),  # LIGHT: lamps
             (rng.uniform(0.2, 0.4), 0.2, 0.14, 1.6, 0.3, 0.0, 0.0),  # LEAVES
             (rng.uniform(0.15, 0.35), 0.4, 0.10, 1.5, 0.4, 0.0, 0.0),  # BARK
             (rng.uniform(0.15, 0.5), 0.8, 0.12, 1.6, 0.6, 0.0, 0.3),  # METAL: poles, rails
-            (0.35, 0.4, 0.08, 1.6, 0.4, 0.0, 0.0),  # SKIN
+            (0.45, 0.4, 0.08, 1.6, 0.4, 0.0, 0.0),  # SKIN
+            (0.03, 0.5, 0.04, 0.06, 0.5, 0.0, 0.0),  # INSIDE of cars: seen through glass twice, so from near alone
         ]
 
     def add(
@@ -49,10 +58,10 @@ class Palette:
         return len(self.rows) - 1
 
     def paint(self) -> int:
-        """Add the lacquer of one vehicle: about half of them look black to a LiDAR unless met at a right angle."""
+        """Add the lacquer of one vehicle: more than half of them look black to a LiDAR unless met at a right angle."""
         rng = self._rng
         gloss = rng.uniform(0.0, 0.45)
-        if rng.random() < 0.40:
+        if rng.random() < 0.48:
             return self.add(rng.uniform(0.0, 0.12), rng.uniform(1.0, 3.0), 0.04, rng.uniform(0.12, 0.40), 0.6, gloss)
         return self.add(rng.uniform(0.25, 0.55), rng.uniform(0.4, 1.3), 0.05, rng.uniform(0.3, 1.0), 0.4, gloss)
 
@@ -66,7 +75,7 @@ class Palette:
     def cloth(self) -> int:
         """Add the clothes of one person."""
         rng = self._rng
-        return self.add(rng.uniform(0.05, 0.55), 0.3, 0.08, rng.uniform(0.9, 2.2), 0.3)
+        return self.add(rng.uniform(0.12, 0.70), 0.3, 0.10, rng.uniform(0.9, 2.2), 0.3)
 
     def table(self) -> np.ndarray:
         """All rows as a ``(M, 7)`` float64 array."""

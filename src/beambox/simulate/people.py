@@ -15,6 +15,7 @@ __all__ = ["cyclist", "pedestrian", "sitting"]
 def pedestrian(size: tuple[float, float, float], palette: Palette, rng: np.random.Generator) -> Shape:
     """A standing or walking person within (length, width, height): the stride spans the length, the arms the width."""
     length, width, h = size
+    h -= rng.uniform(0.0, 0.12)  # annotators leave a margin
     shape, top, trousers = Shape(), palette.cloth(), palette.cloth()
     hx, hy = length / 2, width / 2
     stride = max(hx - 0.13, 0.02) * rng.uniform(0.7, 1.0)
@@ -57,13 +58,14 @@ def sitting(size: tuple[float, float, float], palette: Palette, rng: np.random.G
 def cyclist(size: tuple[float, float, float], palette: Palette, rng: np.random.Generator) -> Shape:
     """A rider on a bicycle; the wheels let most beams pass between their spokes."""
     length, width, h = size
+    h -= rng.uniform(0.02, 0.18)  # annotators leave a margin
     shape, top, trousers = Shape(), palette.cloth(), palette.cloth()
-    hx, hy = length / 2, width / 2
+    hx, hy = length / 2 - rng.uniform(0.0, 0.08), width / 2
     wheel = min(0.34, hx * 0.42)
     axle = hx - wheel
     for x in (axle, -axle):
         turn = rotation(rng.uniform(-0.2, 0.2) if x > 0 else 0.0)
-        shape.ellipsoid((x, 0.0, wheel), (wheel, 0.02, wheel), TYRE, turn, density=9.0)
+        shape.ellipsoid((x, 0.0, wheel), (wheel, 0.02, wheel), TYRE, turn, density=5.0)
         for k in range(8):
             a, b = math.tau * k / 8, math.tau * (k + 1) / 8
             rim = wheel - 0.02
@@ -75,10 +77,11 @@ def cyclist(size: tuple[float, float, float], palette: Palette, rng: np.random.G
         shape.limb(start, end, 0.022, METAL)
     grip = max(hy - 0.06, 0.18)
     shape.limb((bar[0], -grip, bar[2] + 0.04), (bar[0], grip, bar[2] + 0.04), 0.02, METAL)
-    lean = rng.uniform(0.05, 0.25)
+    lean = rng.uniform(0.1, 0.4)
     neck = (saddle[0] + lean * 1.4, 0.0, 0.86 * h)
     shape.ellipsoid((neck[0] + 0.08, 0.0, h - 0.125), (0.11, 0.09, 0.125), SKIN)
-    shape.limb((saddle[0], 0.0, saddle[2] + 0.05), neck, 0.15, top)
+    for side in (1.0, -1.0):  # the back: broader than deep
+        shape.limb((saddle[0], side * 0.05, saddle[2] + 0.05), (neck[0], side * 0.11, neck[2]), 0.13, top)
     for side in (1.0, -1.0):
         shape.limb((neck[0], side * 0.17, neck[2] - 0.06), (bar[0], side * grip, bar[2] + 0.05), 0.045, top)
         pedal = (crank[0] + side * 0.16, side * 0.1, crank[2] - side * 0.05)

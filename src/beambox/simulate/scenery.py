@@ -9,7 +9,7 @@ import numpy as np
 from beambox.simulate.materials import BARK, LEAVES, METAL, PANE, RETRO, Palette
 from beambox.simulate.shapes import Plane, Shape, profile_planes, rotation
 
-__all__ = ["bin_box", "bush", "fence", "hedge", "house", "pole", "rail", "rubble", "tree", "wall"]
+__all__ = ["bin_box", "bush", "fence", "hedge", "house", "pole", "post", "rail", "rubble", "tree", "wall"]
 
 
 def wall(length: float, height: float, palette: Palette, rng: np.random.Generator) -> Shape:
@@ -96,6 +96,22 @@ def pole(height: float, palette: Palette, rng: np.random.Generator) -> Shape:
         shape.box((-0.18, -0.16, 2.2), (0.18, 0.16, 3.1), METAL)
     elif height > 4.5:
         shape.limb((0.0, 0.0, height), (0.0, rng.uniform(-2, 2), height + 0.2), 0.06, METAL)
+    return shape
+
+
+def post(palette: Palette, rng: np.random.Generator) -> Shape:
+    """A thing as slender as a person: bollard, parking meter, hydrant, trunk, young tree."""
+    shape, height, radius = Shape(), rng.uniform(0.6, 2.4), rng.uniform(0.04, 0.24)
+    stuff = (METAL, BARK, palette.facade(), palette.cloth())[rng.integers(4)]
+    shape.prism(0.0, 0.0, radius, -0.3, height, stuff, 8)
+    kind = rng.random()
+    if kind < 0.35:  # a head or a box on top
+        wide = radius + rng.uniform(0.02, 0.2)
+        shape.box((-wide, -wide, height), (wide, wide, height + rng.uniform(0.15, 0.6)), stuff)
+    elif kind < 0.6:  # leaves around it
+        wide = rng.uniform(0.15, 0.45)
+        middle = (0.0, 0.0, height * rng.uniform(0.4, 0.9))
+        shape.ellipsoid(middle, (wide, wide, height * 0.4), LEAVES, None, rng.uniform(3, 12))
     return shape
 
 

@@ -107,6 +107,14 @@ class Shape:
         centre = tuple((a + b) / 2 for a, b in zip(start, end))
         self.ellipsoid(centre, (radius, radius, length / 2 + radius), material, list(zip(u, v, w)))  # type: ignore[arg-type]
 
+    def move_forward(self, distance: float) -> None:
+        """Shift everything added so far along x, metres."""
+        self.planes = [(*p[:3], p[3] + p[0] * distance, p[4]) for p in self.planes]
+        self.parts = [(*p[:3], p[3] + distance, *p[4:]) for p in self.parts]
+        self.patches = [(p[0] + distance, p[1] + distance, *p[2:]) for p in self.patches]
+        self.low[0] += distance
+        self.high[0] += distance
+
     def patch(self, low: Vector, high: Vector, material: int) -> None:
         """Give another material to whatever surface lies between two corners."""
         self.patches.append((low[0], high[0], low[1], high[1], low[2], high[2], material))

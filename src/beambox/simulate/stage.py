@@ -12,9 +12,12 @@ from beambox.simulate.fleets import KITTI_FLEET, Fleet, draw_size
 from beambox.simulate.ground import Ground, ground_height
 from beambox.simulate.materials import Palette
 from beambox.simulate.raycast import Placed
-from beambox.simulate.shapes import Shape
+from beambox.simulate.shapes import Shape, rotation
 
 __all__ = ["Stage", "overlaps"]
+
+CLEARANCE = 0.12
+"""Metres that scenery keeps from an object's box at least, so that what a box holds is the object's."""
 
 
 def overlaps(rectangle: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -113,9 +116,10 @@ class Stage:
         pitch, roll = (-math.atan(along), math.atan(across)) if tilted else (0.0, 0.0)
         shape = _BUILDERS[name](size, self.palette, self.rng)
         yaw = (yaw + math.pi) % (2 * math.pi) - math.pi
-        box = (x, y, z + size[2] / 2, *size, yaw)
+        lean = rotation(yaw, pitch, roll)  # the box stays upright, about the middle of the leaning body
+        box = (x + lean[0][2] * size[2] / 2, y + lean[1][2] * size[2] / 2, z + size[2] / 2, *size, yaw)
         self.placed.append(Placed(shape, (x, y, z), yaw, pitch, roll, name, box))
-        self._occupy(x, y, size[0] / 2, size[1] / 2, yaw)
+        self._occupy(x, y, size[0] / 2 + CLEARANCE, size[1] / 2 + CLEARANCE, yaw)
         distance = math.hypot(x, y)
         self._views.append((math.atan2(y, x), 0.4 * max(size[0], size[1]) / max(distance, 1.0), distance))
         return True

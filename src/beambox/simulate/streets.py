@@ -146,6 +146,7 @@ def dress(stage: Stage, road: Road) -> None:
         if rng.random() < 0.35:
             _thicket(stage, line, side, edge + rng.uniform(0.5, 6.0))
         _clutter(stage, line, side, edge, int(rng.integers(2, 14)))
+        _posts(stage, line, side, int(rng.integers(0, 16)))
         if rng.random() < 0.7:  # what stands behind
             _fronts(stage, line, side, edge + rng.uniform(14.0, 32.0), rng.uniform(0.5, 1.0), low=4.0)
     for _ in range(rng.integers(4, 30)):
@@ -222,6 +223,22 @@ def _fronts(stage: Stage, line: _Line, side: float, setback: float, fill: float,
             stage.add_scenery(shape, x, y, yaw, gap=0.0)
         u += length + (rng.uniform(0, 8) if rng.random() < 0.4 else 0.0)
         setback += rng.normal(0, 0.4)
+
+
+def _posts(stage: Stage, line: _Line, side: float, count: int) -> None:
+    """Slender things on and behind the pavement, alone or in rows, which a network must learn to tell from people."""
+    rng, road = stage.rng, line.road
+    row, u = rng.random() < 0.3, rng.uniform(stage.ahead + 3, 40)
+    s, step = road.half_width + rng.uniform(0.1, road.pavement + 3.0), rng.uniform(1.2, 4.0)
+    shape = scenery.post(stage.palette, rng)
+    for _ in range(count):
+        if not row:
+            u, s = rng.uniform(stage.ahead + 3, 55), road.half_width + rng.uniform(0.1, road.pavement + 8.0)
+            shape = scenery.post(stage.palette, rng)
+        x, y, direction = line.at(u, side * s)
+        u += step
+        if stage.sees(x, y):
+            stage.add_scenery(shape, x, y, direction + rng.normal(0, 0.3), gap=0.3)
 
 
 def _clutter(stage: Stage, line: _Line, side: float, edge: float, count: int) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beambox.simulate.materials import AIR, DARK, GLASS, LIGHT, PANE, RETRO, RIM, TYRE, Palette
+from beambox.simulate.materials import AIR, DARK, GLASS, INSIDE, LIGHT, PANE, RETRO, RIM, TYRE, Palette
 from beambox.simulate.shapes import Plane, Shape, profile_planes
 
 __all__ = ["CAR_STYLES", "bus", "car", "trailer", "tram", "truck", "van"]
@@ -34,13 +34,16 @@ class _Style:
     """Front edge of the bonnet."""
 
 
+FRONT_MARGIN, REAR_MARGIN, SIDE_MARGIN = (0.04, 0.15), (0.0, 0.07), (0.0, 0.08)
+"""Gap between a car's body and its label's box, metres; KITTI's labels leave it, mostly at the nose."""
+
 CAR_STYLES: dict[str, _Style] = {
-    "hatchback": _Style((0.34, 0.48), (1.0, 1.6), (0.66, 0.82), (0.88, 0.97), (0.58, 0.65), (0.44, 0.52)),
-    "saloon": _Style((0.26, 0.40), (1.2, 1.8), (0.26, 0.46), (0.60, 0.76), (0.60, 0.66), (0.44, 0.50)),
-    "estate": _Style((0.28, 0.42), (1.2, 1.7), (0.78, 0.88), (0.92, 0.98), (0.58, 0.64), (0.43, 0.50)),
-    "suv": _Style((0.34, 0.46), (0.8, 1.3), (0.72, 0.86), (0.90, 0.98), (0.58, 0.66), (0.50, 0.58)),
-    "small": _Style((0.44, 0.62), (0.9, 1.4), (0.70, 0.84), (0.90, 0.98), (0.56, 0.63), (0.45, 0.55)),
-    "minivan": _Style((0.50, 0.66), (0.9, 1.3), (0.80, 0.90), (0.93, 0.99), (0.53, 0.60), (0.44, 0.52)),
+    "hatchback": _Style((0.26, 0.42), (1.0, 1.6), (0.58, 0.78), (0.84, 0.95), (0.61, 0.69), (0.46, 0.54)),
+    "saloon": _Style((0.18, 0.34), (1.2, 1.8), (0.20, 0.40), (0.56, 0.72), (0.62, 0.69), (0.46, 0.53)),
+    "estate": _Style((0.20, 0.36), (1.2, 1.7), (0.71, 0.84), (0.88, 0.97), (0.61, 0.68), (0.46, 0.53)),
+    "suv": _Style((0.26, 0.40), (0.8, 1.3), (0.66, 0.81), (0.86, 0.96), (0.61, 0.68), (0.52, 0.60)),
+    "small": _Style((0.34, 0.54), (0.9, 1.4), (0.63, 0.80), (0.86, 0.96), (0.59, 0.67), (0.47, 0.57)),
+    "minivan": _Style((0.42, 0.58), (0.9, 1.3), (0.74, 0.87), (0.90, 0.98), (0.56, 0.64), (0.46, 0.55)),
 }
 
 
@@ -126,16 +129,16 @@ def _lamps(shape: Shape, hx: float, hy: float, h: float, rng: np.random.Generato
 def _seats(shape: Shape, x_front: float, x_rear: float, hy: float, h: float, rng: np.random.Generator) -> None:
     for side in (1.0, -1.0):
         y = side * hy * 0.42
-        shape.box((x_front - 0.14, y - 0.23, 0.28 * h), (x_front + 0.02, y + 0.23, 0.70 * h), DARK)
-        shape.box((x_front - 0.15, y - 0.12, 0.70 * h), (x_front - 0.05, y + 0.12, 0.82 * h), DARK)
-        shape.box((x_front, y - 0.24, 0.24 * h), (x_front + 0.45, y + 0.24, 0.38 * h), DARK)
+        shape.box((x_front - 0.14, y - 0.23, 0.28 * h), (x_front + 0.02, y + 0.23, 0.70 * h), INSIDE)
+        shape.box((x_front - 0.15, y - 0.12, 0.70 * h), (x_front - 0.05, y + 0.12, 0.82 * h), INSIDE)
+        shape.box((x_front, y - 0.24, 0.24 * h), (x_front + 0.45, y + 0.24, 0.38 * h), INSIDE)
         if x_rear < x_front - 0.5:
-            shape.box((x_rear - 0.16, y - 0.12, 0.62 * h), (x_rear - 0.06, y + 0.12, 0.76 * h), DARK)
+            shape.box((x_rear - 0.16, y - 0.12, 0.62 * h), (x_rear - 0.06, y + 0.12, 0.76 * h), INSIDE)
     if x_rear < x_front - 0.5:
-        shape.box((x_rear - 0.18, -hy * 0.75, 0.28 * h), (x_rear, hy * 0.75, 0.63 * h), DARK)
+        shape.box((x_rear - 0.18, -hy * 0.75, 0.28 * h), (x_rear, hy * 0.75, 0.63 * h), INSIDE)
     if rng.random() < 0.35:
-        shape.ellipsoid((x_front + 0.12, hy * 0.42, 0.60 * h), (0.13, 0.22, 0.22 * h), DARK)
-        shape.ellipsoid((x_front + 0.12, hy * 0.42, 0.83 * h), (0.11, 0.10, 0.13), DARK)
+        shape.ellipsoid((x_front + 0.12, hy * 0.42, 0.60 * h), (0.13, 0.22, 0.22 * h), INSIDE)
+        shape.ellipsoid((x_front + 0.12, hy * 0.42, 0.83 * h), (0.11, 0.10, 0.13), INSIDE)
 
 
 def _greenhouse(
@@ -162,18 +165,22 @@ def _greenhouse(
     roof_low = min(z_rear, outline[2][1]) - 0.05
     wide = hy[1] + 0.1
     shape.convex(
-        [*solid, (0.0, 0.0, -1.0, -roof_low, DARK)], (x_rear - 0.15, -wide, roof_low), (x_front + 0.15, wide, top)
+        [*solid, (0.0, 0.0, -1.0, -roof_low, INSIDE)], (x_rear - 0.15, -wide, roof_low), (x_front + 0.15, wide, top)
     )
     middle = 0.5 * (x_front + x_rear) + 0.12 * (x_front - x_rear)
     posts: list[tuple[list[Plane], float, float]] = [
-        ([(-screen[0], 0.0, -screen[2], 0.09 - screen[3], DARK)], x_front - 0.15, x_cowl),
-        ([(1.0, 0.0, 0.0, middle + 0.05, DARK), (-1.0, 0.0, 0.0, 0.05 - middle, DARK)], middle - 0.05, middle + 0.05),
-        ([(-back[0], 0.0, -back[2], max(0.12, 0.08 * (x_cowl - x_tail)) - back[3], DARK)], x_tail, x_rear + 0.35),
+        ([(-screen[0], 0.0, -screen[2], 0.09 - screen[3], INSIDE)], x_front - 0.15, x_cowl),
+        (
+            [(1.0, 0.0, 0.0, middle + 0.05, INSIDE), (-1.0, 0.0, 0.0, 0.05 - middle, INSIDE)],
+            middle - 0.05,
+            middle + 0.05,
+        ),
+        ([(-back[0], 0.0, -back[2], max(0.12, 0.08 * (x_cowl - x_tail)) - back[3], INSIDE)], x_tail, x_rear + 0.35),
     ]
     for extra, x0, x1 in posts:
         for k, side in ((0, 1.0), (1, -1.0)):
             flank = flanks[k]
-            inner: Plane = (0.0, -flank[1], -flank[2], 0.06 - flank[3], DARK)
+            inner: Plane = (0.0, -flank[1], -flank[2], 0.06 - flank[3], INSIDE)
             y0, y1 = sorted((side * (hy[1] - 0.15), side * hy[0]))
             shape.convex([*solid, *extra, inner], (x0, y0, belt), (x1, y1, top))
 
@@ -182,10 +189,11 @@ def car(size: tuple[float, float, float], palette: Palette, rng: np.random.Gener
     """A passenger car of (length, width, height) metres in one of :data:`CAR_STYLES`."""
     length, width, h = size
     shape, style, paint = Shape(), _style_of(length, h, rng), palette.paint()
-    hx, hy = length / 2 - rng.uniform(-0.01, 0.06), width / 2 - rng.uniform(-0.01, 0.035)  # annotators leave a margin
+    front, rear, side = rng.uniform(*FRONT_MARGIN), rng.uniform(*REAR_MARGIN), rng.uniform(*SIDE_MARGIN)
+    hx, hy = (length - front - rear) / 2, width / 2 - side
     top = h - rng.uniform(0.0, 0.07)
     belt, nose = rng.uniform(*style.belt) * h, rng.uniform(*style.nose) * h
-    clear = rng.uniform(0.11, 0.15) * h
+    clear = rng.uniform(0.08, 0.14) * h
     x_cowl, x_tail = rng.uniform(*style.cowl) * hx, -rng.uniform(*style.tail) * hx
     x_front = x_cowl - rng.uniform(*style.rake) * (0.94 * top - belt)
     x_rear = min(-rng.uniform(*style.roof_rear) * hx, x_front - 0.5)
@@ -202,11 +210,11 @@ def car(size: tuple[float, float, float], palette: Palette, rng: np.random.Gener
     hull += _plan_planes(hx, hy, radius, (rng.uniform(0.1, 0.2), rng.uniform(0.06, 0.16)), paint)
     # The hull without its passenger room: engine, boot, doors and floor, so that beams through a window find seats.
     boot = min(x_tail + 0.35, x_rear + 0.2) if x_tail < -0.8 * hx else x_tail + 0.1
-    shape.convex([*hull, (-1.0, 0.0, 0.0, -x_cowl + 0.15, DARK)], (x_cowl - 0.15, -hy, clear), (hx, hy, belt + 0.02))
-    shape.convex([*hull, (1.0, 0.0, 0.0, boot, DARK)], (-hx, -hy, clear), (boot, hy, belt + 0.02))
-    shape.convex([*hull, (0.0, -1.0, 0.0, 0.12 - hy, DARK)], (-hx, hy - 0.12, clear), (hx, hy, belt + 0.02))
-    shape.convex([*hull, (0.0, 1.0, 0.0, 0.12 - hy, DARK)], (-hx, -hy, clear), (hx, 0.12 - hy, belt + 0.02))
-    shape.convex([*hull, (0.0, 0.0, 1.0, 0.28 * h, DARK)], (-hx, -hy, clear), (hx, hy, 0.28 * h))
+    shape.convex([*hull, (-1.0, 0.0, 0.0, -x_cowl + 0.15, INSIDE)], (x_cowl - 0.15, -hy, clear), (hx, hy, belt + 0.02))
+    shape.convex([*hull, (1.0, 0.0, 0.0, boot, INSIDE)], (-hx, -hy, clear), (boot, hy, belt + 0.02))
+    shape.convex([*hull, (0.0, -1.0, 0.0, 0.12 - hy, INSIDE)], (-hx, hy - 0.12, clear), (hx, hy, belt + 0.02))
+    shape.convex([*hull, (0.0, 1.0, 0.0, 0.12 - hy, INSIDE)], (-hx, -hy, clear), (hx, 0.12 - hy, belt + 0.02))
+    shape.convex([*hull, (0.0, 0.0, 1.0, 0.28 * h, INSIDE)], (-hx, -hy, clear), (hx, hy, 0.28 * h))
     glasshouse = [(x_tail, belt), (x_cowl, belt), (x_front, 0.965 * top), ((x_front + x_rear) / 2, top),
                   (x_rear, rng.uniform(0.945, 0.985) * top)]  # fmt: skip
     dark_tail = PANE if rng.random() < 0.25 else GLASS
@@ -221,6 +229,7 @@ def car(size: tuple[float, float, float], palette: Palette, rng: np.random.Gener
     _lamps(shape, hx, hy, h, rng, 0.92 * belt)
     for side in (1.0, -1.0):
         shape.ellipsoid((x_cowl - 0.22, side * (hy + 0.06), belt + 0.06), (0.07, 0.11, 0.075), paint)
+    shape.move_forward((rear - front) / 2)
     return shape
 
 

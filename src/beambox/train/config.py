@@ -9,9 +9,10 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.augment import AugmentConfig
 from beambox.metrics.once import SUPERCLASSES
+from beambox.train.recipes import find_recipe
 
 __all__ = [
     "AugmentSection",
@@ -169,6 +170,10 @@ class Recipe(Section):
     """Name of the run and of its weights."""
     description: str = ""
     """One sentence: what comes out, and which published result it repeats."""
+    takes: str = ""
+    """How long it takes, and on what."""
+    ran: str = ""
+    """Whether it was ever run to the end, and where the result stands."""
     detector: DetectorSection
     """The network."""
     data: tuple[SourceSection, ...] = Field(min_length=1)
@@ -218,23 +223,29 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     """Read a recipe from a YAML file.
 
     Args:
-        path: the file.
+        path: the name of a shipped recipe, or a file.
         overrides: changes as ``a.b=value``, value in YAML; list entries by position (``data.0.split=val``).
 
     Raises:
         MissingFileError: if there is no such file.
         BeamboxError: if it is not YAML, has an unknown key or a wrong value; the message names the place.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"there is no recipe {path}; the shipped ones lie in the folder recipes/")
+    values = load_recipe(path)
+    if "stages" in values:
+        raise BeamboxError(f"recipe {path} has stages; read it by `read_stages`, or train it by `beambox train`")
+    return parse_recipe(apply_overrides(values, overrides), where=str(path))
+
+
+def load_recipe(path: str | Path) -> dict[str, Any]:
+    """Return the plain values of a recipe, given by its name or file; unchecked but for being a mapping."""
+    path = find_recipe(path)
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
         raise BeamboxError(f"recipe {path} is not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise BeamboxError(f"recipe {path} must be a mapping of keys to values, got {type(values).__name__}")
-    return parse_recipe(apply_overrides(values, overrides), where=str(path))
+    return values
 
 
 def parse_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:

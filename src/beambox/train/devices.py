@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 from beambox.infer.precision import bfloat16_reason
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def make_fabric(precision: str) -> Fabric:
     try:
         from lightning_fabric import Fabric
     except ImportError:
-        raise BeamboxError("training needs the package lightning-fabric: pip install 'beambox[train]'") from None
+        raise BeamboxError(f"training needs the package lightning-fabric: {how_to_install('train')}") from None
     device = "cuda" if torch.cuda.is_available() else "cpu"
     chosen = choose_precision(precision, device)
     world = int(os.environ.get("WORLD_SIZE", "1")) if "TORCHELASTIC_RUN_ID" in os.environ else 1

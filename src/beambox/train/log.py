@@ -13,6 +13,8 @@ from typing import IO, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from beambox.checks import how_to_install, printable
+
 __all__ = ["Clock", "RunLog", "duration"]
 
 
@@ -81,14 +83,14 @@ class RunLog:
         try:
             from torch.utils.tensorboard.writer import SummaryWriter
         except ImportError:
-            self.say("no TensorBoard log: tensorboard is not installed (pip install 'beambox[train]')")
+            self.say(f"no TensorBoard log: tensorboard is not installed ({how_to_install('train')})")
             return None
         return SummaryWriter(str(folder), purge_step=first)
 
     def say(self, text: str) -> None:
         """Print a line."""
         if self.active:
-            self._console.print(text, markup=False)
+            self._console.print(printable(text), markup=False)
             if not self._console.is_terminal:
                 sys.stdout.flush()
 

@@ -19,7 +19,7 @@ from beambox import __version__
 from beambox.checks import BeamboxError
 from beambox.data.database import ObjectDatabase
 from beambox.data.mixture import MixedSource
-from beambox.detectors.catalogue import build, config_to_dict, name_of
+from beambox.detectors.catalogue import build, config_to_dict, name_of, tensors_since
 from beambox.detectors.weights import fill, read_weights, save_weights
 from beambox.train.batchnorm import measure_statistics, measured_statistics
 from beambox.train.checkpoint import (
@@ -69,7 +69,7 @@ class TrainStep(nn.Module):
 
     def forward(self, work: TrainingBatch) -> dict[str, Tensor]:
         """Return the named losses of a batch."""
-        predictions = self.detector(work.batch, work.grid)
+        predictions = self.detector(work.batch, work.grid, work.batch.labels)
         with torch.autocast(work.batch.points.device.type, enabled=False):
             return self.detector.loss(predictions, work.batch.labels)
 
@@ -165,10 +165,11 @@ class Run:
         own = self.identity()
         if saved.detector["name"] != own["name"]:
             raise BeamboxError(f"{path} is of the detector {saved.detector['name']}, the recipe is of {own['name']}")
-        restore_module(self.detector, part(saved.tensors, "model."), str(path))
-        restore_optimizer(self.optimizer.optimizer, self.names, part(saved.tensors, "optim."))
+        tensors = tensors_since(self.detector, saved.tensors)
+        restore_module(self.detector, part(tensors, "model."), str(path))
+        restore_optimizer(self.optimizer.optimizer, self.names, part(tensors, "optim."))
         if self.ema and "ema_updates" in saved.state:
-            restore_module(self.ema.module, part(saved.tensors, "ema."), str(path))
+            restore_module(self.ema.module, part(tensors, "ema."), str(path))
             self.ema.updates = saved.state["ema_updates"]
         if saved.state["precision"]:
             self.fabric.strategy.precision.load_state_dict(saved.state["precision"])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import torch
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.source import FrameSource
@@ -36,8 +38,15 @@ class Score:
 class Validator:
     """Scores a detector on the recipe's validation source."""
 
-    def __init__(self, section: ValidationSection, source: FrameSource) -> None:
-        self.section, self.source = section, source
+    def __init__(self, section: ValidationSection, source: FrameSource, dtype: torch.dtype = torch.float32) -> None:
+        """Set up.
+
+        Args:
+            section: what to score by.
+            source: frames to score on.
+            dtype: what the network computes in, as ``beambox evaluate --precision`` would have it.
+        """
+        self.section, self.source, self.dtype = section, source, dtype
 
     def __call__(self, model: Any) -> Score:
         """Score a detector; its training mode is restored."""
@@ -49,8 +58,11 @@ class Validator:
                 f'validation.choose_by: the detector has no class "{section.choose_by}"'
                 f"{did_you_mean(section.choose_by, choices)}"
             )
-        result = score_by(section, scored_frames(detect_frames(network(model), self.source)), classes)
-        return summarise_once(result, section) if isinstance(result, OnceResult) else summarise(result, section)
+        result = score_by(section, scored_frames(detect_frames(network(model, self.dtype), self.source)), classes)
+        score = summarise_once(result, section) if isinstance(result, OnceResult) else summarise(result, section)
+        precision = str(self.dtype).removeprefix("torch.")
+        table = {name: {**entry, "precision": precision} for name, entry in score.table.items()}
+        return replace(score, text=f"{score.text} ({precision})", table=table)
 
 
 def score_by(

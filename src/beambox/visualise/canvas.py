@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, printable
 from beambox.io import replacing
 from beambox.visualise.colours import Colour
 
@@ -73,7 +73,7 @@ class Canvas:
         place = (at[0] * SUPER, at[1] * SUPER)
         self._draw.text(
             place,
-            words,
+            _shown(words),
             fill=colour,
             font=_font(size),
             anchor=anchor,
@@ -83,7 +83,7 @@ class Canvas:
 
     def text_width(self, words: str, size: float = 13) -> float:
         """Return how wide a line of text is, in pixels."""
-        return self._draw.textlength(words, font=_font(size)) / SUPER
+        return self._draw.textlength(_shown(words), font=_font(size)) / SUPER
 
     def paste(self, picture: Image.Image, at: tuple[int, int]) -> None:
         """Lay a finished picture onto this one, its upper left corner at ``at``."""
@@ -111,6 +111,11 @@ def save_picture(picture: Image.Image, path: Path) -> None:
 
 def _drawn(points: Sequence[Point]) -> list[Point]:
     return [(float(u) * SUPER, float(v) * SUPER) for u, v in points]
+
+
+def _shown(words: str) -> str:
+    """One line that fits a legend: names come from files and may hold anything."""
+    return printable(" ".join(words.split()) if words.strip() else words, 90)
 
 
 def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

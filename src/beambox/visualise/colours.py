@@ -38,7 +38,7 @@ _STOPS = np.array(
 def class_colour(name: str) -> Colour:
     """Return the colour of a class; the same for the same name in every picture."""
     key = name.lower()
-    return _CLASSES.get(key) or _OTHERS[sum(key.encode()) % len(_OTHERS)]
+    return _CLASSES.get(key) or _OTHERS[sum(key.encode("utf-8", "backslashreplace")) % len(_OTHERS)]
 
 
 def gradient(share: NDArray[np.floating]) -> NDArray[np.uint8]:

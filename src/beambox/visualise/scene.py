@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, printable
 from beambox.structures import Detections, Frame, Labels
 from beambox.visualise.colours import TRUTH, class_colour, gradient
 from beambox.visualise.image import open_image
@@ -97,7 +97,7 @@ def scene_html(
         "score": min_score,
         "period": round(1000 * period),
     }
-    name = html.escape(title or scenes[0].frame.id or "sweep")
+    name = html.escape(printable(title or scenes[0].frame.id or "sweep", 500))
     parts = {"TITLE": name, "DATA": script_json(content), "THREE": three, "SCRIPT": script}
     return fill(template("scene.html"), parts)
 

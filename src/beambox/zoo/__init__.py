@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["shipped"]
+__all__ = ["DEFAULT", "shipped"]
+
+DEFAULT = "pointpillars-sim"
+"""What is taken where no weights are named: free for any use, as none of the others need be."""
 
 
 def shipped() -> dict[str, Path]:

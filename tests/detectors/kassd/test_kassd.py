@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,8 +12,9 @@ from beambox.detectors.kassd.keypoints import ExtraPoint, KeypointLayout
 from beambox.detectors.kassd.network import LamReduce
 from beambox.detectors.second import KITTI_CAR, second
 from beambox.geometry.grid import VoxelGrid
-from beambox.layers.heads import LossWeights
-from beambox.structures import Batch
+from beambox.layers.heads import AnchorPredictions, LossWeights
+from beambox.layers.roi import best_overlap
+from beambox.structures import Batch, Labels
 from oracles.learning import check_found, check_headings, learn_by_heart, scan_with_cars
 from oracles.small_detectors import CAR, KASSD, VARIANTS, car_frame, made
 
@@ -64,9 +66,9 @@ def test_swapped_weights_scale_the_losses() -> None:
     model = kassd(KASSD).eval()
     batch = Batch.of([car_frame(1, CAR)])
     assert batch.labels is not None
-    printed = model.loss(model(batch), batch.labels)
+    printed = model.loss(model(batch, labels=batch.labels), batch.labels)
     model.config = replace(KASSD, swapped=True)
-    swapped = model.loss(model(batch), batch.labels)
+    swapped = model.loss(model(batch, labels=batch.labels), batch.labels)
     assert set(printed) == {"cls", "loc", "direction", "keypoints"}
     torch.testing.assert_close(swapped["cls"], printed["cls"] / 2)
     torch.testing.assert_close(swapped["loc"], printed["loc"] * 2)
@@ -97,7 +99,18 @@ def scored_by(maps: torch.Tensor, config: KassdConfig = KASSD, codes: float = 0.
     head.box.fill_(codes)
     head.direction.zero_()
     head.direction[..., 1] = 1.0  # keeps the anchor's own heading, 0 radians
-    return model, replace(predictions, maps=maps)
+    return model, replace(predictions, maps=maps, **scores_of(model, predictions.head, maps))
+
+
+def scores_of(
+    model: Kassd, head: AnchorPredictions, maps: torch.Tensor, labels: list[Labels] | None = None
+) -> dict[str, Any]:
+    """What KAM says, given its maps and what the head says."""
+    if model.kam is None:
+        return {"candidates": None, "scores": None}
+    boxes = model.candidates(head, labels)
+    scores = model.kam.score(maps, head.grid, boxes.sample, boxes.boxes, boxes.classes, boxes.places)
+    return {"candidates": boxes, "scores": scores}
 
 
 def test_the_keypoints_score_replaces_the_class_score_or_multiplies_it() -> None:
@@ -113,7 +126,7 @@ def test_the_keypoints_score_replaces_the_class_score_or_multiplies_it() -> None
     model, predictions = scored_by(maps - 3.0)
     assert len(model.decode(predictions)[0]) == 0, "a box the keypoints call bad is dropped, whatever its class score"
     model, predictions = scored_by(maps, replace(KASSD, kam=False))
-    (found,) = model.decode(replace(predictions, maps=None))
+    (found,) = model.decode(predictions)
     assert found.scores.tolist() == pytest.approx([1 / (1 + math.exp(-2.0))])
 
 
@@ -126,33 +139,37 @@ def test_keypoints_are_read_where_the_box_is_also_in_another_region() -> None:
     boxes = predictions.head.decoded_rows(0, rows)
     place = predictions.head.anchors[rows, :2]
     maps[:, :, 4 - 3 : 4 + 4, 8 - 6 : 8 + 7] = torch.randn(1, 31, 7, 13)
-    whole = model.scores(predictions, 0, boxes, torch.zeros(1, dtype=torch.int64), place)
+    assert model.kam is not None
+    zero = torch.zeros(1, dtype=torch.int64)
+    whole = model.kam.score(maps, KASSD.grid, zero, boxes, zero, place)
     window = KASSD.grid.window((8, 8), (96, 96))
-    moved = KassdPredictions(replace(predictions.head, grid=window), maps[..., 1:13, 1:13])
-    torch.testing.assert_close(model.scores(moved, 0, boxes, torch.zeros(1, dtype=torch.int64), place), whole)
+    torch.testing.assert_close(model.kam.score(maps[..., 1:13, 1:13], window, zero, boxes, zero, place), whole)
 
 
 def test_labelled_boxes_are_right_and_far_ones_wrong() -> None:
     model, predictions = scored_by(torch.zeros(1, 31, 16, 16))
     objects = predictions.head.decoded_rows(0, torch.tensor([(4 * 16 + 8) * 2]))
-    kinds = torch.zeros(1, dtype=torch.int64)
+
+    def loss(boxes: torch.Tensor) -> float:
+        labels = [Labels(boxes, ("Car",) * len(boxes))]
+        return model.loss(replace(predictions, **scores_of(model, predictions.head, predictions.maps, labels)), labels)[
+            "keypoints"
+        ].item()
+
     # the anchor's box and the labelled box are the same and right: two focal losses of a coin toss, 0.25 / 4 * ln 2
-    right = model.keypoint_loss(predictions, 0, objects, kinds)
-    assert right.item() == pytest.approx(0.25 * 0.25 * math.log(2), rel=1e-5)
+    assert loss(objects) == pytest.approx(0.25 * 0.25 * math.log(2), rel=1e-5)
     shifted = objects + torch.tensor([0.0, 0.6, 0, 0, 0, 0, 0])  # IoU (1.6 - 0.6) / (1.6 + 0.6) = 0.45
-    mixed = model.keypoint_loss(predictions, 0, shifted, kinds)
-    assert mixed.item() == pytest.approx((0.25 + 0.75) * 0.25 * math.log(2), rel=1e-5)
-    none = model.keypoint_loss(predictions, 0, objects[:0], kinds[:0])
-    assert none.item() == pytest.approx(0.75 * 0.25 * math.log(2), rel=1e-5)
-    far = model.quality(objects, kinds, torch.cat((shifted, objects)), torch.tensor([0, 1]))
+    assert loss(shifted) == pytest.approx((0.25 + 0.75) * 0.25 * math.log(2), rel=1e-5)
+    assert loss(objects[:0]) == pytest.approx(0.75 * 0.25 * math.log(2), rel=1e-5)
+    far, _ = best_overlap(objects, torch.tensor([0]), torch.cat((shifted, objects)), torch.tensor([0, 1]))
     assert far.item() == pytest.approx(1.0 / 2.2, rel=1e-4), "an object of another class does not count"
 
 
 def test_without_a_sure_anchor_the_best_ones_learn() -> None:
     model, predictions = scored_by(torch.zeros(1, 31, 16, 16))
     predictions.head.cls.fill_(-10.0)
-    nothing = torch.zeros(0, 7), torch.zeros(0, dtype=torch.int64)
-    assert model.keypoint_loss(predictions, 0, *nothing).item() == pytest.approx(100 * 0.75 * 0.25 * math.log(2))
+    of_best = replace(predictions, **scores_of(model, predictions.head, predictions.maps, [Labels.empty()]))
+    assert model.loss(of_best, [Labels.empty()])["keypoints"].item() == pytest.approx(100 * 0.75 * 0.25 * math.log(2))
 
 
 def test_the_scores_loss_moves_boxes_only_if_asked() -> None:
@@ -161,7 +178,7 @@ def test_the_scores_loss_moves_boxes_only_if_asked() -> None:
         model = kassd(replace(KASSD, kam_options=KamOptions(box_gradient=asked)))
         batch = Batch.of([car_frame(1, CAR)])
         assert batch.labels is not None
-        model.loss(model(batch), batch.labels)["keypoints"].backward()
+        model.loss(model(batch, labels=batch.labels), batch.labels)["keypoints"].backward()
         moved = [
             layer.weight.grad is not None and bool(layer.weight.grad.any())
             for layer in (model.head.box, model.head.cls)
@@ -198,11 +215,12 @@ def test_scores_of_a_sample_do_not_depend_on_its_neighbours() -> None:
     model = made("kassd").eval()
     one, two = car_frame(3, CAR), car_frame(4, CAR)
     alone, joined = model(Batch.of([two])), model(Batch.of([one, two]))
-    boxes = torch.tensor([CAR])
-    arguments = (boxes, torch.zeros(1, dtype=torch.int64), boxes[:, :2])
-    torch.testing.assert_close(
-        model.scores(joined, 1, *arguments), model.scores(alone, 0, *arguments), atol=1e-5, rtol=1e-4
-    )
+    boxes, zero = torch.tensor([CAR]), torch.zeros(1, dtype=torch.int64)
+    read = [
+        model.kam.score(said.maps, KASSD.grid, sample, boxes, zero, boxes[:, :2])
+        for said, sample in ((joined, zero + 1), (alone, zero))
+    ]
+    torch.testing.assert_close(*read, atol=1e-5, rtol=1e-4)
 
 
 def test_a_map_of_odd_size_works() -> None:

@@ -121,15 +121,19 @@ def test_maps_that_hold_their_column_or_row_score_its_mean() -> None:
     rows = torch.arange(200, dtype=torch.float64)[:, None].expand(1, 31, 200, 176)
     at = map_coordinates(kam.layout.points(boxes, anchors), KITTI, 8)
     classes = torch.zeros(50, dtype=torch.int64)
-    torch.testing.assert_close(kam.score(columns, KITTI, 0, boxes, classes, anchors), at[..., 0].mean(dim=1))
-    torch.testing.assert_close(kam.score(rows, KITTI, 0, boxes, classes, anchors), at[..., 1].mean(dim=1))
+    torch.testing.assert_close(
+        kam.score(columns, KITTI, torch.tensor([0]), boxes, classes, anchors), at[..., 0].mean(dim=1)
+    )
+    torch.testing.assert_close(
+        kam.score(rows, KITTI, torch.tensor([0]), boxes, classes, anchors), at[..., 1].mean(dim=1)
+    )
 
 
 def test_each_point_reads_its_own_map_of_its_class_and_sample() -> None:
     kam = KeypointScores(1, KeypointLayout(m=2, n=2, d=0, e=0), 8, num_classes=2)
     maps = torch.arange(16.0).reshape(2, 8, 1, 1).expand(2, 8, 200, 176)
     boxes = torch.tensor([[10.0, 0, 0, 4, 2, 1, 0.4]]).expand(2, 7)
-    score = kam.score(maps, KITTI, 1, boxes, torch.tensor([0, 1]), boxes[:, :2])
+    score = kam.score(maps, KITTI, torch.tensor([1]), boxes, torch.tensor([0, 1]), boxes[:, :2])
     assert score.tolist() == pytest.approx([(8 + 9 + 10 + 11) / 4, (12 + 13 + 14 + 15) / 4])
 
 
@@ -166,7 +170,7 @@ def test_gradients_with_respect_to_maps_and_boxes() -> None:
     classes, anchors = torch.zeros(2, dtype=torch.int64), torch.tensor([[2.11, 0.05], [4.3, 2.2]], dtype=torch.float64)
 
     def score(maps: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
-        return kam.score(maps, grid, 0, boxes, classes, anchors)
+        return kam.score(maps, grid, torch.tensor([0]), boxes, classes, anchors)
 
     assert torch.autograd.gradcheck(score, (maps, boxes), atol=1e-6)
     score(maps, boxes).sum().backward()

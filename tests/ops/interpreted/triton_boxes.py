@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from beambox.ops.nms import nms
+from beambox.ops.nms import nms, nms_of_samples
 from beambox.ops.nms import reference as plain_nms
 from beambox.ops.rotated_iou import gpu, intersection_bev, iou_3d, iou_bev
 from beambox.ops.rotated_iou import reference as plain
@@ -64,6 +64,27 @@ def test_nms_equals_reference(count, threshold):
     for limits in ((4096, 500), (70, 7)):
         got = nms(boxes, scores, threshold, *limits).tolist()
         assert edit_distance(got, plain_nms.nms(boxes, scores, threshold, *limits).tolist()) == 0
+
+
+@pytest.mark.parametrize(
+    ("places", "post", "extent"), [(1, 3, 5.0), (150, 200, 12.0), (150, 20, 3.0), (200, 90, 300.0)]
+)
+def test_nms_of_samples_equals_reference(places, post, extent):
+    generator = torch.Generator().manual_seed(places)
+    boxes = random_boxes(4 * places, generator, extent, torch.float32).view(4, places, 7).to(DEVICE)
+    boxes[1] = boxes[1, :1]  # all the same
+    count = torch.tensor([places, places, 0, places // 2], device=DEVICE)
+    got, want = (run(boxes, count, 0.1, post) for run in (nms_of_samples, plain_nms.nms_of_samples))
+    assert got[0].equal(want[0]) and got[1].equal(want[1])
+    assert got[1][1] == 1 and got[1][2] == 0
+
+
+def test_a_chain_of_boxes_each_over_the_next_keeps_every_other():
+    boxes = torch.tensor([0.0, 0.0, 0.0, 4.0, 2.0, 2.0, 0.0], device=DEVICE).repeat(1, 130, 1)
+    boxes[0, :, 0] = torch.arange(130, device=DEVICE) * 3.0
+    count = torch.tensor([130], device=DEVICE)
+    kept, number = nms_of_samples(boxes, count, 0.05, 100)
+    assert kept[0, :65].tolist() == list(range(0, 130, 2)) and number.tolist() == [65]
 
 
 @pytest.mark.parametrize(("rows", "columns", "size"), [(0, 3, 4), (1, 1, 1), (40, 7, 13), (30, 130, 4), (0, 5, 0)])

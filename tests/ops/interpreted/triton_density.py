@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from beambox.ops.ball_count import ball_count, reference
+from beambox.ops.ball_count import ball_count, ball_counts, reference
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -23,3 +23,10 @@ def test_ball_count_of_full_columns():
     z = torch.arange(64, device=DEVICE)
     index = torch.stack((z * 0, z, z * 0, z * 0), dim=1)
     assert ball_count(index, (1.0, 1.0, 0.01), 0.9).tolist() == [64] * 64
+
+
+def test_several_radii_with_known_extent_and_voxels_that_stand_twice():
+    index = torch.tensor([[0, 0, 0, 0], [1, 70, 3, 4], [1, 69, 3, 4], [1, 70, 3, 4], [1, 70, 5, 4]], device=DEVICE)
+    got = ball_counts(index, (0.1, 0.2, 0.3), (0.35, 0.5), (2, 71, 6, 5))
+    assert got.equal(reference.ball_counts(index, (0.1, 0.2, 0.3), (0.35, 0.5)))
+    assert got.tolist() == [[1, 1], [2, 3], [2, 2], [2, 3], [1, 2]]

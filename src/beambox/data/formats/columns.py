@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from beambox.checks import BeamboxError, MissingFileError
+from beambox.checks import BeamboxError, MissingFileError, how_to_install
 
 __all__ = ["Columns", "decode", "library"]
 
@@ -44,7 +44,7 @@ def library(name: str, path: Path, extra: str = "formats") -> ModuleType:
     except ImportError:
         raise BeamboxError(
             f"reading {path.suffix or 'such'} files ({path.name}) needs the library {name.split('.', maxsplit=1)[0]}: "
-            f'pip install "beambox[{extra}]", or convert the file to .npy'
+            f"{how_to_install(extra)}; or convert the file to .npy"
         ) from None
 
 

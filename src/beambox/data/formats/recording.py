@@ -1,24 +1,28 @@
 """Recordings of ROS (.bag, .mcap, .db3, or a folder of rosbag2), through rosbags; each PointCloud2 message is a sweep.
 
-A sweep in a recording has a path, though no file: recording / topic / nanoseconds of the message.
+A sweep in a recording has a path, though no file: recording / topic / nanoseconds of the message; where several
+messages have one time, the second is called nanoseconds-2.
 """
 
 from __future__ import annotations
 
+import itertools
+import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.formats.columns import Columns, decode, library
+from beambox.data.formats.kept import kept_open
+from beambox.data.formats.point_cloud2 import cloud_columns
+from beambox.io import check_file_name
 
 __all__ = ["ENDINGS", "read_message", "recording_of", "sweeps_in"]
 
 ENDINGS = (".bag", ".mcap", ".db3")
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-NUMBERS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-"""Number types of a cloud's columns by PointField's ``datatype``, counted from 1."""
+STAMP = re.compile(r"([0-9]{1,19})(?:-([0-9]{1,9}))?")
 
 
 def recording_of(path: Path) -> Path | None:
@@ -46,7 +50,7 @@ def sweeps_in(path: Path) -> list[Path]:
         return [path]
 
     def read() -> list[Path]:
-        with _reader(root) as reader:
+        with kept_open(root, _reader) as reader:
             clouds = [one for one in reader.connections if one.msgtype == POINT_CLOUD]
             topics = sorted({one.topic.strip("/") for one in clouds})
             chosen = topics[0] if not topic and len(topics) == 1 else topic
@@ -62,9 +66,15 @@ def sweeps_in(path: Path) -> list[Path]:
                     f'{root} has no point clouds under "{chosen}"{did_you_mean(chosen, topics)}; it has '
                     f"{', '.join(topics)}"
                 )
+            for part in chosen.split("/"):
+                check_file_name(part, f"{root}, the topic {chosen[:60]!a}")
             wanted = [one for one in clouds if one.topic.strip("/") == chosen]
-            stamps = dict.fromkeys(time for _, time, _ in reader.messages(wanted))
-            return [root / chosen / str(time) for time in stamps]
+            repeats: Counter[int] = Counter()
+            found = []
+            for _, time, _ in reader.messages(wanted):
+                repeats[time] += 1
+                found.append(root / chosen / (str(time) if repeats[time] == 1 else f"{time}-{repeats[time]}"))
+            return found
 
     return decode(_file(root), "recording", read)
 
@@ -83,23 +93,27 @@ def read_message(path: Path) -> Columns:
         )
 
     def read() -> Columns:
-        with _reader(root) as reader:
+        with kept_open(root, _reader) as reader:
             wanted = [one for one in reader.connections if one.topic.strip("/") == topic]
-            for connection, _, raw in reader.messages(wanted, start=stamp, stop=stamp + 1) if wanted else ():
-                return _columns(reader.deserialize(raw, connection.msgtype), path)
-        raise BeamboxError(f'{root} has no message under "{topic}" at {stamp} ns')
+            time, number = stamp
+            messages: Any = reader.messages(wanted, start=time, stop=time + 1) if wanted else ()
+            for connection, _, raw in itertools.islice(messages, number - 1, None):
+                return cloud_columns(reader.deserialize(raw, connection.msgtype), str(path))
+        which = f"{time} ns" if number == 1 else f"{time} ns, the {number}th at that time"
+        raise BeamboxError(f'{root} has no message under "{topic}" at {which}')
 
     return decode(_file(root), "recording", read)
 
 
-def _parts(path: Path) -> tuple[Path, str, int | None]:
-    """Split a path into the recording, the topic without its first slash, and the time."""
+def _parts(path: Path) -> tuple[Path, str, tuple[int, int] | None]:
+    """Split a path into the recording, the topic without its first slash, the time and which message of that time."""
     root = recording_of(path)
     if root is None:
         raise BeamboxError(f"{path} is not in a recording ({', '.join(ENDINGS)}, or a folder of rosbag2)")
     inside = path.relative_to(root).parts
-    if len(inside) > 1 and inside[-1].isdigit():
-        return root, "/".join(inside[:-1]), int(inside[-1])
+    stamp = STAMP.fullmatch(inside[-1]) if len(inside) > 1 else None
+    if stamp is not None:
+        return root, "/".join(inside[:-1]), (int(stamp[1]), int(stamp[2] or 1))
     return root, "/".join(inside), None
 
 
@@ -108,27 +122,7 @@ def _file(root: Path) -> Path:
 
 
 def _reader(root: Path) -> Any:
-    """Open a recording; older ones, without definitions of their types, hold ROS 2's own."""
+    """Make a reader of a recording; older ones, without definitions of their types, hold ROS 2's own."""
     highlevel = library("rosbags.highlevel", root, "recordings")
     typesys = library("rosbags.typesys", root, "recordings")
     return highlevel.AnyReader([root], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
-
-
-def _columns(cloud: Any, path: Path) -> Columns:
-    """Take the columns of one number a point out of a PointCloud2 message; rows may end in padding."""
-    fields = [field for field in cloud.fields if field.count == 1 and field.name]
-    order = ">" if cloud.is_bigendian else "<"
-    layout = np.dtype(
-        {
-            "names": [field.name for field in fields],
-            "formats": [order + NUMBERS[field.datatype - 1] for field in fields],
-            "offsets": [field.offset for field in fields],
-            "itemsize": cloud.point_step,
-        }
-    )
-    data = np.asarray(cloud.data, dtype=np.uint8)
-    if len(data) < cloud.height * cloud.row_step:
-        raise BeamboxError(f"{path} is cut short: {cloud.height * cloud.row_step} bytes promised, {len(data)} there")
-    rows = data[: cloud.height * cloud.row_step].reshape(cloud.height, cloud.row_step)
-    points = np.frombuffer(rows[:, : cloud.width * cloud.point_step].tobytes(), dtype=layout)
-    return Columns(layout.names or (), [points[name] for name in layout.names or ()])

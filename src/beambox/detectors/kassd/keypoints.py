@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, choose_fields
 from beambox.geometry.boxes import rotate_z
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.bev import conv_bn_relu
@@ -59,6 +59,7 @@ class KeypointLayout:
     """Which point joins the inner ones."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         if (self.m, self.n) != (0, 0) and min(self.m, self.n) < 2:
             raise BeamboxError(f"`m` and `n` count both corners: at least 2 each, or 0 both, got {self.m} and {self.n}")
         if (self.d, self.e) != (0, 0) and min(self.d, self.e) < 1:
@@ -174,22 +175,27 @@ class KeypointScores(nn.Module):
             conv_bn_relu(width, width),
             nn.Conv2d(width, num_classes * layout.count, 1),
         )
+        nn.init.normal_(self.maps[-1].weight, std=0.01)  # pyright: ignore[reportArgumentType]
         prior = 0.01  # as in the anchor head: a fresh network calls one box in a hundred good
         nn.init.constant_(self.maps[-1].bias, -math.log((1 - prior) / prior))  # pyright: ignore[reportArgumentType]
 
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, num_classes * count, Y, X)`` logits."""
-        return self.maps(bev)
+        *hidden, last = self.maps
+        for layer in hidden:
+            bev = layer(bev)  # (B, width, Y, X)
+        with torch.autocast(bev.device.type, enabled=False):  # scores are compared with each other: all their digits
+            return last(bev.float())
 
     def score(
-        self, maps: Tensor, grid: VoxelGrid, sample: int, boxes: Tensor, classes: Tensor, anchors: Tensor
+        self, maps: Tensor, grid: VoxelGrid, sample: Tensor, boxes: Tensor, classes: Tensor, anchors: Tensor
     ) -> Tensor:
-        """Score boxes of one sample: the mean of their keypoints' logits (KASSD, equation 5).
+        """Score boxes: the mean of their keypoints' logits (KASSD, equation 5).
 
         Args:
             maps: of :meth:`forward`.
             grid: the region the maps cover.
-            sample: position of the sample in the batch.
+            sample: ``(N,)`` int64 position of each box's sample in the batch.
             boxes: ``(N, 7)`` with resolved headings.
             classes: ``(N,)`` int64.
             anchors: ``(N, 2)`` x, y of the boxes' anchors.
@@ -200,5 +206,4 @@ class KeypointScores(nn.Module):
         at = map_coordinates(self.layout.points(boxes, anchors), grid, self.stride)  # (N, K, 2)
         count = self.layout.count
         channel = classes[:, None] * count + torch.arange(count, device=maps.device)  # (N, K)
-        which = torch.full_like(channel, sample)
-        return sample_bilinear(maps, which, channel, at).mean(dim=1)
+        return sample_bilinear(maps, sample[:, None], channel, at).mean(dim=1)

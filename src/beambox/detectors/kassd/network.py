@@ -40,8 +40,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError
-from beambox.detectors.contract import detections_from, targets_from
+from beambox.checks import BeamboxError, choose_fields, chosen
+from beambox.detectors.contract import detections_from, expect_made, targets_from
 from beambox.detectors.kassd.keypoints import KeypointLayout, KeypointScores
 from beambox.detectors.kassd.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
 from beambox.detectors.second import KITTI_VOXELS, STRIDE
@@ -59,8 +59,8 @@ from beambox.layers.heads import (
     select_boxes,
 )
 from beambox.layers.losses import sigmoid_focal
+from beambox.layers.roi import best_overlap
 from beambox.ops.nms import nms
-from beambox.ops.rotated_iou import iou_3d
 from beambox.ops.voxelize import Voxels, voxelize
 from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
@@ -135,6 +135,9 @@ class KamOptions:
     score: KamScore = KamScore.REPLACE
     """What becomes of the score at test time: replace or multiply the class score."""
 
+    def __post_init__(self) -> None:
+        choose_fields(self)
+
 
 @dataclass(frozen=True)
 class KassdConfig:
@@ -190,6 +193,7 @@ class KassdConfig:
     """Post-processing at test time."""
 
     def __post_init__(self) -> None:
+        choose_fields(self)
         if not self.anchors:
             raise BeamboxError("`anchors` must name at least one class, got none")
         if not self.llm and self.neck not in (Neck.LLM, Neck.SECOND):
@@ -214,13 +218,35 @@ class KassdConfig:
 
 
 @dataclass(frozen=True)
+class Candidates:
+    """Boxes that KAM looks at, sample after sample; N in all."""
+
+    boxes: Tensor
+    """``(N, 7)`` with resolved headings."""
+    classes: Tensor
+    """``(N,)`` int64."""
+    cls: Tensor
+    """``(N,)`` the head's score of that class, in [0, 1]; 1 for labelled boxes."""
+    places: Tensor
+    """``(N, 2)`` x, y of the anchors they come from; a labelled box is its own anchor."""
+    sample: Tensor
+    """``(N,)`` int64, ascending."""
+    quality: Tensor | None
+    """``(N,)`` largest 3-D overlap with an object of the box's class; None without labels."""
+
+
+@dataclass(frozen=True)
 class KassdPredictions:
     """What the network says of a batch."""
 
     head: AnchorPredictions
     """Of every anchor."""
     maps: Tensor | None
-    """``(B, classes * keypoints, Y, X)`` score maps, logits; None without KAM."""
+    """``(B, classes * keypoints, Y, X)`` score maps, logits; None without KAM, like what follows."""
+    candidates: Candidates | None
+    """The boxes that KAM looked at."""
+    scores: Tensor | None
+    """``(N,)`` what their keypoints say of them, logits."""
 
 
 class Kassd(nn.Module):
@@ -236,20 +262,31 @@ class Kassd(nn.Module):
         self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
         self.neck = make_neck(config, self.encoder.bev_channels(config.grid.shape[0]))
         self.head = AnchorHead(self.neck.out_channels, self.anchors)
+        nn.init.normal_(self.head.cls.weight, std=0.01)  # behind LLM, default weights would spread the prior of 0.01
         self.kam = (
             KeypointScores(self.neck.out_channels, config.keypoints, STRIDE, len(config.anchors), config.kam_width)
             if config.kam
             else None
         )
 
-    def forward(self, batch: Batch, grid: VoxelGrid | None = None) -> KassdPredictions:
-        """Predict over the configured region, or over ``grid``, which must have cells of the same size."""
+    def forward(
+        self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
+    ) -> KassdPredictions:
+        """Predict over the configured region, or over ``grid``, which must have cells of the same size.
+
+        With ``labels`` KAM scores the boxes it learns from, without those that may become detections.
+        """
         grid = self.config.grid if grid is None else grid
         voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
         stages = self.encoder(voxels)
         bev = self.neck(stages.bev)  # (B, 128, ny / 8, nx / 8)
-        maps = None if self.kam is None else self.kam(bev)  # (B, K, ny / 8, nx / 8)
-        return KassdPredictions(self.head(bev, grid), maps)
+        head = self.head(bev, grid)
+        if self.kam is None:
+            return KassdPredictions(head, None, None, None)
+        maps = self.kam(bev)  # (B, K, ny / 8, nx / 8)
+        boxes = self.candidates(head, labels)  # N boxes
+        scores = self.kam.score(maps, grid, boxes.sample, boxes.boxes, boxes.classes, boxes.places)  # (N,)
+        return KassdPredictions(head, maps, boxes, scores)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
@@ -270,73 +307,101 @@ class Kassd(nn.Module):
         config = self.config
         boxes, classes = targets_from(labels, config.classes, predictions.head.cls.device)
         losses = anchor_loss(predictions.head, boxes, classes, self.anchors, config.loss_weights, config.smooth_l1_beta)
-        if predictions.maps is not None:
-            terms = [self.keypoint_loss(predictions, i, *of_sample) for i, of_sample in enumerate(zip(boxes, classes))]
-            losses["keypoints"] = config.keypoint_weight * torch.stack(terms).mean()
+        if predictions.candidates is not None and predictions.scores is not None:
+            losses["keypoints"] = config.keypoint_weight * self.keypoint_loss(
+                predictions.candidates, predictions.scores, len(boxes)
+            )
         return losses
 
-    def keypoint_loss(self, predictions: KassdPredictions, sample: int, objects: Tensor, kinds: Tensor) -> Tensor:
-        """Compute one sample's focal loss of the keypoints' scores, divided by the number of right boxes.
+    def keypoint_loss(self, candidates: Candidates, scores: Tensor, batch_size: int) -> Tensor:
+        """Compute the focal loss of the keypoints' scores, of each sample over its right boxes; the mean of samples."""
+        options, quality = self.config.kam_options, candidates.quality
+        expect_made(quality is not None, wanted=True)
+        assert quality is not None
+        least = quality.new_tensor(options.positive_iou).expand(len(self.config.anchors))[candidates.classes]
+        right = (quality >= least).float()
+        wanted = (2 * quality - 0.5).clamp(0, 1) if options.soft_targets else right
+        focal = sigmoid_focal(scores.float(), wanted)  # (N,)
+        of_sample = focal.new_zeros(batch_size).index_add(0, candidates.sample, focal)  # (B,)
+        count = right.new_zeros(batch_size).index_add(0, candidates.sample, right)  # (B,)
+        return (of_sample / count.clamp(min=1)).mean()
+
+    def candidates(self, head: AnchorPredictions, labels: Sequence[Labels] | None) -> Candidates:
+        """Choose the boxes that KAM looks at, as :class:`KamOptions` says.
+
+        Without labels: the head's best. With labels: more of them, the labelled boxes, and how good each is.
+        """
+        of_samples = range(len(head.cls))
+        if labels is None:
+            chosen = [self.best_boxes(head, sample, self.config.kam_options.test_boxes) for sample in of_samples]
+        else:
+            objects, kinds = targets_from(labels, self.config.classes, head.cls.device)
+            chosen = [self.boxes_to_learn(head, sample, objects[sample], kinds[sample]) for sample in of_samples]
+        quality = None if labels is None else torch.cat([c.quality for c in chosen if c.quality is not None])
+        return Candidates(
+            torch.cat([c.boxes for c in chosen]),
+            torch.cat([c.classes for c in chosen]),
+            torch.cat([c.cls for c in chosen]),
+            torch.cat([c.places for c in chosen]),
+            torch.cat([c.sample for c in chosen]),
+            quality,
+        )
+
+    def best_boxes(self, head: AnchorPredictions, sample: int, limit: int, least: int = 0) -> Candidates:
+        """Return one sample's best boxes from the threshold on; where there is none, the best ``least``."""
+        rows, cls, classes = best_anchors(head, sample, self.config.kam_options.threshold, limit)
+        if not len(rows) and least:
+            rows, cls, classes = best_anchors(head, sample, 0.0, least)
+        boxes = head.decoded_rows(sample, rows)
+        return Candidates(boxes, classes, cls, head.anchors[rows, :2], torch.full_like(rows, sample), None)
+
+    def boxes_to_learn(self, head: AnchorPredictions, sample: int, objects: Tensor, kinds: Tensor) -> Candidates:
+        """Return one sample's best boxes and its labelled ones, and how good they are.
 
         Args:
-            predictions: of the batch.
+            head: predictions.
             sample: position in the batch.
             objects: ``(M, 7)`` labelled boxes.
             kinds: ``(M,)`` int64 classes.
         """
-        options, head = self.config.kam_options, predictions.head
-        rows, _, predicted = best_anchors(head, sample, options.threshold, options.train_boxes)
-        if not len(rows):
-            rows, _, predicted = best_anchors(head, sample, 0.0, options.train_least)
+        options = self.config.kam_options
+        found = self.best_boxes(head, sample, options.train_boxes, options.train_least)
         inside = head.grid.contains(objects)
-        boxes = torch.cat((head.decoded_rows(sample, rows), objects[inside]))
-        classes = torch.cat((predicted, kinds[inside]))
-        places = torch.cat((head.anchors[rows, :2], objects[inside, :2]))  # a labelled box is its own anchor
-        logits = self.scores(predictions, sample, boxes if options.box_gradient else boxes.detach(), classes, places)
-        target = self.quality(boxes.detach(), classes, objects, kinds)
-        least = target.new_tensor(options.positive_iou).expand(len(self.config.anchors))[classes]
-        right = (target >= least).float()
-        wanted = (2 * target - 0.5).clamp(0, 1) if options.soft_targets else right
-        return sigmoid_focal(logits.float(), wanted).sum() / right.sum().clamp(min=1)
-
-    @staticmethod
-    def quality(boxes: Tensor, classes: Tensor, objects: Tensor, kinds: Tensor) -> Tensor:
-        """Return each box's largest 3-D overlap with an object of its class, ``(N,)``; 0 where there is none."""
-        if not len(objects):
-            return boxes.new_zeros(len(boxes))
-        overlap = iou_3d(boxes, objects)  # (N, M)
-        return torch.where(classes[:, None] == kinds, overlap, 0.0).amax(dim=1)
-
-    def scores(
-        self, predictions: KassdPredictions, sample: int, boxes: Tensor, classes: Tensor, places: Tensor
-    ) -> Tensor:
-        """Return the logits of boxes of one sample at their keypoints, ``(N,)``."""
-        assert self.kam is not None and predictions.maps is not None
-        return self.kam.score(predictions.maps, predictions.head.grid, sample, boxes, classes, places)
+        labelled, their_classes = objects[inside], kinds[inside]
+        boxes = torch.cat((found.boxes if options.box_gradient else found.boxes.detach(), labelled))
+        classes = torch.cat((found.classes, their_classes))
+        return Candidates(
+            boxes,
+            classes,
+            torch.cat((found.cls, found.cls.new_ones(len(labelled)))),
+            torch.cat((found.places, labelled[:, :2])),
+            torch.full_like(classes, sample),
+            best_overlap(boxes.detach(), classes, objects, kinds)[0],
+        )
 
     def decode(self, predictions: KassdPredictions) -> list[Detections]:
         """Return the detections of each sample, best first."""
-        if predictions.maps is None:
+        if predictions.candidates is None or predictions.scores is None:
             kept = select_boxes(predictions.head, self.config.post)
         else:
-            kept = [self.rescored(predictions, sample) for sample in range(len(predictions.maps))]
+            kept = self.select(predictions.candidates, predictions.scores, len(predictions.head.cls))
         return detections_from(kept, self.config.classes)
 
-    def rescored(self, predictions: KassdPredictions, sample: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Keep the boxes of one sample that the keypoints call good: boxes, scores and classes, best first."""
-        options, post, head = self.config.kam_options, self.config.post, predictions.head
-        rows, by_class, label = best_anchors(head, sample, options.threshold, options.test_boxes)
-        boxes = head.decoded_rows(sample, rows)
-        score = torch.sigmoid(self.scores(predictions, sample, boxes, label, head.anchors[rows, :2]).float())
-        if options.score is KamScore.MULTIPLY:
-            score = score * by_class
-        good = score >= post.score_threshold
-        boxes, score, label = boxes[good], score[good], label[good]
-        keep = nms(boxes, score, post.nms_iou, post.nms_pre, post.nms_post)
-        return boxes[keep], score[keep], label[keep]
+    def select(self, found: Candidates, scores: Tensor, batch_size: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Keep the boxes that the keypoints call good: boxes, scores and classes of each sample, best first."""
+        expect_made(found.quality is not None, wanted=False)
+        post, kept = self.config.post, []
+        score = torch.sigmoid(scores.float())
+        if self.config.kam_options.score is KamScore.MULTIPLY:
+            score = score * found.cls
+        for sample in range(batch_size):
+            row = torch.nonzero((found.sample == sample) & (score >= post.score_threshold))[:, 0]
+            row = row[nms(found.boxes[row], score[row], post.nms_iou, post.nms_pre, post.nms_post)]
+            kept.append((found.boxes[row], score[row], found.classes[row]))
+        return kept
 
 
-def location_attention(high: Tensor, low: Tensor, reduce: LamReduce = LamReduce.SUM) -> Tensor:
+def location_attention(high: Tensor, low: Tensor, reduce: LamReduce | str = LamReduce.SUM) -> Tensor:
     """Join two maps by a softmax over the pair at every place (LAM; KASSD, equations 1 and 2).
 
     ``(p0, p1) = softmax(sum_c high, sum_c low)``, output ``p0 * high + p1 * low``. It has no parameters.
@@ -349,6 +414,7 @@ def location_attention(high: Tensor, low: Tensor, reduce: LamReduce = LamReduce.
     Returns:
         ``(B, C, Y, X)``.
     """
+    reduce = chosen("reduce", reduce, LamReduce)
     difference = (high - low).sum(dim=1, keepdim=True, dtype=torch.promote_types(high.dtype, torch.float32))
     if reduce is LamReduce.MEAN:
         difference = difference / high.shape[1]
@@ -409,13 +475,27 @@ class LocationAttention(nn.Module):
         width: int = 128,
         reuse: bool = True,
         lam: bool = True,
-        reduce: LamReduce = LamReduce.SUM,
+        reduce: LamReduce | str = LamReduce.SUM,
         context: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.levels = FeatureReuse(in_channels, width, reuse, context)
-        self.lam, self.reduce = lam, reduce
+        self.lam, self.reduce = lam, chosen("reduce", reduce, LamReduce)
         self.out_channels = width
+        if lam and self.reduce is LamReduce.SUM:
+            self.open_lam(width)
+
+    def open_lam(self, width: int) -> None:
+        """Start with levels whose channel sums differ by about 1, so that both learn.
+
+        The paper names no initialisation. By PyTorch's, the sums over 128 channels differ by 88 at the start, the
+        softmax is 1 and 0 to the last bit, and F4 gets no gradient until it happens to win somewhere. Both
+        deconvolutions start alike, so that they cancel, and F0 and F1, which are left, start small: 2 / c.
+        """
+        levels = self.levels
+        levels.up_low.load_state_dict(levels.up_high.state_dict())
+        for block in (levels.reduce, levels.three[-1]):
+            nn.init.constant_(block[1].weight, 2 / width)  # pyright: ignore
 
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, width, Y, X)``."""

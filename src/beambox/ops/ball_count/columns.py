@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from torch import Tensor
 
 from beambox.ops.ball_count.reference import TOLERANCE
 
-__all__ = ["ball_columns", "extent", "map_too_large"]
+__all__ = ["ball_columns", "extent", "map_too_large", "padding"]
 
 LARGEST_MAP = 1 << 28  # words of 64 cells; 2 GiB
 
@@ -41,7 +42,12 @@ def extent(index: Tensor) -> tuple[list[int], list[int]]:
     return low.tolist(), (high - low + 1).tolist()
 
 
-def map_too_large(span: list[int], columns: np.ndarray) -> bool:
+def padding(columns: Sequence[np.ndarray]) -> tuple[int, int]:
+    """Return how far the columns of some balls reach in y and x."""
+    pad_y, pad_x = np.abs(np.concatenate(columns)[:, :2]).max(axis=0)
+    return int(pad_y), int(pad_x)
+
+
+def map_too_large(span: Sequence[int], pad: tuple[int, int]) -> bool:
     """Tell whether the padded map of one sample would not fit into a reasonable memory."""
-    pad_y, pad_x = np.abs(columns[:, :2]).max(axis=0)
-    return (span[1] // 64 + 1) * (span[2] + 2 * pad_y) * (span[3] + 2 * pad_x) > LARGEST_MAP
+    return (span[1] // 64 + 1) * (span[2] + 2 * pad[0]) * (span[3] + 2 * pad[1]) > LARGEST_MAP

@@ -15,33 +15,40 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from beambox.ops.ball_count import reference
-from beambox.ops.ball_count.columns import ball_columns, extent, map_too_large
+from beambox.ops.ball_count.columns import ball_columns, extent, map_too_large, padding
 from beambox.ops.jit import jit, run_in_blocks
 
-__all__ = ["ball_count"]
+__all__ = ["ball_counts"]
 
 
-def ball_count(index: Tensor, cell: tuple[float, float, float], radius: float) -> Tensor:
-    """Count the voxels within a radius; see :func:`beambox.ops.ball_count.ball_count`."""
-    columns = ball_columns(cell, radius)
-    low, span = extent(index)
-    if map_too_large(span, columns):
-        return reference.ball_count(index, cell, radius)
-    pad_y, pad_x = np.abs(columns[:, :2]).max(axis=0)
+def ball_counts(
+    index: Tensor, cell: tuple[float, float, float], radii: tuple[float, ...], within: Any = None
+) -> Tensor:
+    """Count the voxels within some radii; see :func:`beambox.ops.ball_count.ball_counts`."""
+    columns = [ball_columns(cell, radius) for radius in radii]
+    pad_y, pad_x = padding(columns)
+    low, span = extent(index)  # tighter than what is known, and looked at in no time
+    if map_too_large(span, (pad_y, pad_x)):
+        return reference.ball_counts(index, cell, radii)
     place = index.numpy() - np.array(low) + np.array([0, 0, pad_y, pad_x])
-    shape = (span[1] // 64 + 1, span[2] + 2 * int(pad_y), span[3] + 2 * int(pad_x))  # words in z, y, x
-    steps = columns[:, 0] * shape[2] + columns[:, 1]  # offsets in the flat map
-    heights = columns[:, 2].copy()
-    out = np.empty(len(index), np.int64)
+    shape = (span[1] // 64 + 1, span[2] + 2 * pad_y, span[3] + 2 * pad_x)  # words in z, y, x
+    out = np.empty((len(radii), len(index)), np.int64)
     for sample in range(span[0]):
         cells = np.zeros((shape[0], shape[1] * shape[2]), np.uint64)
         after, tops = _stack(cells, place, sample, shape[2])
+        for ball, counts in zip(columns, out):
+            _count_ball(ball, cells, place, after, tops, shape[2], counts)
+    return torch.from_numpy(out).t().contiguous()
 
-        def count(start: int, stop: int, cells: Any = cells, after: Any = after, tops: Any = tops) -> None:
-            _count(cells, place, after, tops[start:stop], shape[2], steps, heights, out)
 
-        run_in_blocks(count, len(tops), smallest=256)
-    return torch.from_numpy(out)
+def _count_ball(ball: Any, cells: Any, place: Any, after: Any, tops: Any, width: int, out: Any) -> None:
+    """Write the counts of one sample's voxels for one ball's columns."""
+    steps, heights = ball[:, 0] * width + ball[:, 1], ball[:, 2].copy()  # offsets in the flat map
+    run_in_blocks(
+        lambda start, stop: _count(cells, place, after, tops[start:stop], width, steps, heights, out),
+        len(tops),
+        smallest=256,
+    )
 
 
 def _count_ones(typing_context: Any, word: Any) -> Any:

@@ -5,58 +5,68 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from beambox.geometry.constants import constant
 from beambox.ops.ball_count import reference
-from beambox.ops.ball_count.columns import ball_columns, extent, map_too_large
+from beambox.ops.ball_count.columns import ball_columns, extent, map_too_large, padding
 
-__all__ = ["ball_count"]
+__all__ = ["ball_counts"]
 
 BLOCK = 128
 
 
-def ball_count(index: Tensor, cell: tuple[float, float, float], radius: float) -> Tensor:
-    """Count the voxels within a radius; see :func:`beambox.ops.ball_count.ball_count`."""
-    columns = ball_columns(cell, radius)
-    low, span = extent(index)
+def ball_counts(
+    index: Tensor,
+    cell: tuple[float, float, float],
+    radii: tuple[float, ...],
+    within: tuple[int, int, int, int] | None = None,
+) -> Tensor:
+    """Count the voxels within some radii; see :func:`beambox.ops.ball_count.ball_counts`."""
+    columns = [ball_columns(cell, radius) for radius in radii]
+    pad_y, pad_x = padding(columns)
+    low, span = extent(index) if within is None else ((0, 0, 0, 0), within)
     samples = span[0]
-    if map_too_large([1, span[1], span[2] * samples, span[3]], columns):
-        return reference.ball_count(index, cell, radius)
-    pad_y, pad_x = (int(pad) for pad in np.abs(columns[:, :2]).max(axis=0))
+    if map_too_large([1, span[1], span[2] * samples, span[3]], (pad_y, pad_x)):
+        return reference.ball_counts(index, cell, radii)
     words, height, width = span[1] // 64 + 1, span[2] + 2 * pad_y, span[3] + 2 * pad_x
+    size, voxels, device = samples * height * width, len(index), index.device
 
-    sample, z, y, x = (index - index.new_tensor(low)).unbind(dim=1)
-    column = (sample * height + y + pad_y) * width + x + pad_x  # (V,) in a map of all samples
-    bits = torch.stack((column, z), dim=1).unique(dim=0)  # each bit once, as bits are added below
-    cells = torch.zeros(words * samples * height * width, dtype=torch.int64, device=index.device)
-    word = (bits[:, 1] >> 6) * (samples * height * width) + bits[:, 0]
-    cells.index_add_(0, word, torch.ones_like(word) << (bits[:, 1] & 63))
-
-    table = torch.from_numpy(columns).to(index.device)
-    steps, heights = (table[:, 0] * width + table[:, 1]).contiguous(), table[:, 2].contiguous()
-    out = torch.empty(len(index), dtype=torch.int64, device=index.device)
-    _count[(triton.cdiv(len(index), BLOCK),)](
-        cells,
-        column,
-        z.contiguous(),
-        steps,
-        heights,
-        out,
-        len(index),
-        len(steps),
-        words,
-        samples * height * width,
-        BLOCK,
-    )
+    cells = torch.zeros(words * size, dtype=torch.int64, device=device)
+    column, z = torch.empty((2, voxels), dtype=torch.int64, device=device)  # (V,) each; columns of all samples
+    blocks = (triton.cdiv(voxels, BLOCK),)
+    _stack[blocks](index.contiguous(), cells, column, z, voxels, size, *low, height, width, pad_y, pad_x, BLOCK)
+    out = torch.empty((voxels, len(radii)), dtype=torch.int64, device=device)
+    for place, ball in enumerate(columns):
+        steps, heights = (constant(tuple(v.tolist()), device) for v in (ball[:, 0] * width + ball[:, 1], ball[:, 2]))
+        _count[blocks](
+            cells, column, z, steps, heights, out[:, place], voxels, len(steps), words, size, len(radii), BLOCK
+        )
     return out
 
 
 @triton.jit
-def _count(cells, column, z, steps, heights, out, voxels, reach, words, map_size, block: tl.constexpr):
+def _stack(
+    index, cells, column, z, voxels, size, low_b, low_z, low_y, low_x, height, width, pad_y, pad_x, block: tl.constexpr
+):  # fmt: skip
+    """Write each voxel's column and level, and set its bit: in any order, and twice does not matter."""
+    voxel = tl.program_id(0) * block + tl.arange(0, block)
+    has = voxel < voxels
+    row = index + voxel.to(tl.int64) * 4
+    sample, level = tl.load(row, has, 0) - low_b, tl.load(row + 1, has, 0) - low_z
+    y, x = tl.load(row + 2, has, 0) - low_y + pad_y, tl.load(row + 3, has, 0) - low_x + pad_x
+    place = (sample * height + y) * width + x
+    tl.store(column + voxel, place, has)
+    tl.store(z + voxel, level, has)
+    one = tl.full((block,), 1, tl.int64)
+    tl.atomic_or(cells + (level >> 6) * size + place, one << (level & 63), has)
+
+
+@triton.jit
+def _count(cells, column, z, steps, heights, out, voxels, reach, words, map_size, radii, block: tl.constexpr):
     """Count for one block of voxels."""
     voxel = tl.program_id(0) * block + tl.arange(0, block)
     has = voxel < voxels
@@ -75,7 +85,7 @@ def _count(cells, column, z, steps, heights, out, voxels, reach, words, map_size
             found = found << tl.where(some, 63 - high, 0).to(tl.uint64)
             found = found >> tl.where(some, 63 - high + low, 0).to(tl.uint64)
             total += _ones(found)
-    tl.store(out + voxel, total, has)
+    tl.store(out + voxel * radii, total, has)
 
 
 @triton.jit

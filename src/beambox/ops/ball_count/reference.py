@@ -5,10 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["TOLERANCE", "ball_count"]
+__all__ = ["TOLERANCE", "ball_count", "ball_counts"]
 
 TOLERANCE = 1e-6  # square metres; a centre at the radius counts, whatever its decimals round to
 ROWS_AT_ONCE = 256  # bounds the memory of the pairs
+
+
+def ball_counts(
+    index: Tensor, cell: tuple[float, float, float], radii: tuple[float, ...], extent: object = None
+) -> Tensor:
+    """Count for several radii; see :func:`beambox.ops.ball_count.ball_counts`."""
+    return torch.stack([ball_count(index, cell, radius) for radius in radii], dim=1)
 
 
 def ball_count(index: Tensor, cell: tuple[float, float, float], radius: float) -> Tensor:

@@ -11,7 +11,7 @@ from beambox.checks import BeamboxError, expect_shape
 from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
 from beambox.ops.nms import reference
 
-__all__ = ["nms"]
+__all__ = ["nms", "nms_of_samples"]
 
 
 def _numba() -> Callable[..., Tensor]:
@@ -30,6 +30,18 @@ BACKENDS = (
     Backend("triton", can_run_triton, _triton),
     Backend("numba", can_run_numba, _numba),
     Backend("reference", always, lambda: reference.nms),
+)
+
+
+def _triton_of_samples() -> Callable[..., tuple[Tensor, Tensor]]:
+    from beambox.ops.nms import gpu
+
+    return gpu.nms_of_samples
+
+
+OF_SAMPLES = (
+    Backend("triton", can_run_triton, _triton_of_samples),
+    Backend("reference", always, lambda: reference.nms_of_samples),
 )
 
 
@@ -62,3 +74,25 @@ def nms(boxes: Tensor, scores: Tensor, threshold: float, pre: int = 4096, post: 
         return torch.empty(0, dtype=torch.int64, device=boxes.device)
     kept = choose("nms", BACKENDS, boxes, scores)(boxes[known], scores[known], threshold, pre, post)
     return known[kept]
+
+
+def nms_of_samples(boxes: Tensor, count: Tensor, threshold: float, post: int = 500) -> tuple[Tensor, Tensor]:
+    """Keep the best boxes of each sample, as :func:`nms` does; sizes are fixed, so that no GPU is waited for.
+
+    Args:
+        boxes: ``(B, P, 7)``, each sample's best first.
+        count: ``(B,)`` int64 how many of each sample's P there are; the others are not looked at.
+        threshold: IoU in [0, 1].
+        post: keep at most so many.
+
+    Returns:
+        ``(B, post)`` int64 places among the P of the kept boxes, best first, then -1; and ``(B,)`` int64 their numbers.
+
+    Raises:
+        BeamboxError: if a shape does not fit, or a limit is negative.
+    """
+    expect_shape("boxes", boxes, (None, None, 7))
+    expect_shape("count", count, (len(boxes),))
+    if post < 0:
+        raise BeamboxError(f"`post` must not be negative, got {post}")
+    return choose("nms_of_samples", OF_SAMPLES, boxes, count)(boxes.detach(), count, threshold, post)

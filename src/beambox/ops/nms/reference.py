@@ -7,7 +7,7 @@ from torch import Tensor
 
 from beambox.ops.rotated_iou.reference import iou_bev
 
-__all__ = ["nms"]
+__all__ = ["nms", "nms_of_samples"]
 
 
 def nms(boxes: Tensor, scores: Tensor, threshold: float, pre: int = 4096, post: int = 500) -> Tensor:
@@ -25,3 +25,14 @@ def nms(boxes: Tensor, scores: Tensor, threshold: float, pre: int = 4096, post: 
             break
         suppressed |= overlaps[candidate]
     return order[torch.tensor(kept, dtype=torch.int64, device=order.device)]
+
+
+def nms_of_samples(boxes: Tensor, count: Tensor, threshold: float, post: int) -> tuple[Tensor, Tensor]:
+    """Keep the best boxes of each sample; see :func:`beambox.ops.nms.nms_of_samples`."""
+    kept = torch.full((len(boxes), post), -1, dtype=torch.int64, device=boxes.device)
+    number = torch.zeros_like(count)
+    for sample, known in enumerate(count.tolist()):
+        falling = -torch.arange(known, device=boxes.device)
+        rows = nms(boxes[sample, :known], falling, threshold, known, post) if known and post else falling[:0]
+        kept[sample, : len(rows)], number[sample] = rows, len(rows)
+    return kept, number

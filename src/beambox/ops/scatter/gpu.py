@@ -23,7 +23,9 @@ def segment_sum(values: Tensor, segment: Tensor, size: int) -> Tensor:
 
 def segment_mean(values: Tensor, segment: Tensor, size: int) -> Tensor:
     """Average the rows of each segment; see :func:`beambox.ops.scatter.segment_mean`."""
-    count = torch.bincount(segment, minlength=size).clamp(min=1).to(values.dtype)
+    by_segment = segment.sort().values
+    edges = torch.searchsorted(by_segment, torch.arange(size + 1, device=segment.device))  # (S + 1,)
+    count = (edges[1:] - edges[:-1]).clamp(min=1).to(values.dtype)  # bincount would make the host wait
     return segment_sum(values, segment, size) / count[:, None]
 
 

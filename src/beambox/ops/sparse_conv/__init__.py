@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose, pinned
 from beambox.ops.sparse_conv import reference
 from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple, linear_keys
 from beambox.ops.sparse_conv.tensor import SparseTensor
@@ -19,12 +20,17 @@ __all__ = [
     "Sites",
     "SparseTensor",
     "Triple",
+    "find_chain",
     "inverse_conv3d",
     "kernel_map",
     "linear_keys",
     "sparse_conv3d",
     "submanifold_conv3d",
 ]
+
+
+MOST_CELLS = 1 << 31
+"""Bytes of the map of a level on a GPU; beyond, its sites are found by sorting."""
 
 
 def _can_run_numba(*tensors: Tensor) -> str | None:
@@ -59,12 +65,19 @@ def _numba_targets() -> Callable[..., Tensor]:
     return find_targets
 
 
+def _triton_targets() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.gpu_maps import find_levels
+
+    return lambda sites, geometry: find_levels(sites, (geometry,))[0].sorted_keys
+
+
 BACKENDS = (
     Backend("triton", _can_run_triton, _triton),
     Backend("numba", _can_run_numba, _numba),
     Backend("reference", always, lambda: reference.convolve),
 )
 TARGET_BACKENDS = (
+    Backend("triton", can_run_triton, _triton_targets),
     Backend("numba", can_run_numba, _numba_targets),
     Backend("reference", always, lambda: reference.find_targets),
 )
@@ -78,11 +91,37 @@ def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
     if geometry.submanifold:
         target = sites
     else:
-        keys = choose("find_targets", TARGET_BACKENDS, sites.sorted_keys)(sites, geometry)
+        backends = TARGET_BACKENDS if _maps_fit(sites, (geometry,)) else TARGET_BACKENDS[1:]
+        keys = choose("find_targets", backends, sites.sorted_keys)(sites, geometry)
         target = Sites.from_keys(keys, geometry.output_shape(sites.shape), sites.batch_size)
     found = KernelMap(sites, target, geometry)
     sites.maps[geometry] = found
     return found
+
+
+def find_chain(sites: Sites, geometries: Sequence[Geometry]) -> None:
+    """Find the sites of a chain of strided convolutions together, where finding each by itself would wait for a GPU.
+
+    They are kept with the sites they start from, as :func:`kernel_map` keeps them; elsewhere nothing is done.
+    """
+    one_by_one = can_run_triton(sites.sorted_keys) is not None or pinned() not in (None, "triton")
+    if one_by_one or not _maps_fit(sites, geometries) or geometries[0] in sites.maps:
+        return
+    from beambox.ops.sparse_conv.gpu_maps import find_levels
+
+    for geometry, target in zip(geometries, find_levels(sites, geometries), strict=True):
+        sites.maps[geometry] = KernelMap(sites, target, geometry)
+        sites = target
+
+
+def _maps_fit(sites: Sites, geometries: Sequence[Geometry]) -> bool:
+    """Tell whether a byte for every cell of the levels is not too much."""
+    shape = sites.shape
+    for geometry in geometries:
+        shape = geometry.output_shape(shape)
+        if sites.batch_size * math.prod(shape) > MOST_CELLS:
+            return False
+    return True
 
 
 def submanifold_conv3d(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_same_length, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
 from beambox.ops.sparse_conv import Sites, Triple
 from beambox.ops.voxel_query import reference
 
@@ -20,7 +20,17 @@ def _numba() -> Callable[..., Tensor]:
     return voxel_query
 
 
-BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.voxel_query))
+def _triton() -> Callable[..., Tensor]:
+    from beambox.ops.voxel_query.gpu import voxel_query
+
+    return voxel_query
+
+
+BACKENDS = (
+    Backend("triton", can_run_triton, _triton),
+    Backend("numba", can_run_numba, _numba),
+    Backend("reference", always, lambda: reference.voxel_query),
+)
 
 
 def voxel_query(

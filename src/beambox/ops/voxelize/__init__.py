@@ -9,7 +9,7 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
 from beambox.geometry.grid import VoxelGrid
-from beambox.ops.dispatch import Backend, always, can_run_numba, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose, waiting_is_dear
 from beambox.ops.voxelize import reference
 from beambox.ops.voxelize.voxels import Voxels
 
@@ -22,7 +22,17 @@ def _numba() -> Callable[..., Voxels]:
     return cpu.voxelize
 
 
-BACKENDS = (Backend("numba", can_run_numba, _numba), Backend("reference", always, lambda: reference.voxelize))
+def _gpu() -> Callable[..., Voxels]:
+    from beambox.ops.voxelize import gpu
+
+    return gpu.voxelize
+
+
+BACKENDS = (
+    Backend("triton", can_run_triton, _gpu),  # of PyTorch's own kernels
+    Backend("numba", can_run_numba, _numba),
+    Backend("reference", always, lambda: reference.voxelize),
+)
 
 
 def voxelize(
@@ -50,7 +60,7 @@ def voxelize(
         The kept points grouped by voxel, and the voxels.
 
     Raises:
-        BeamboxError: if a shape or type does not fit, or ``sample`` leaves ``0 .. batch_size - 1``.
+        BeamboxError: if a shape or type does not fit, or, on the CPU, ``sample`` leaves ``0 .. batch_size - 1``.
     """
     expect_shape("points", points, (None, None))
     expect_dtype("points", points, torch.float32, torch.float64)
@@ -62,7 +72,7 @@ def voxelize(
     for name, limit in (("max_points", max_points), ("max_voxels", max_voxels)):
         if limit is not None and limit < 1:
             raise BeamboxError(f"`{name}` must be at least 1, or None for no limit, got {limit}")
-    if len(sample):
+    if len(sample) and not waiting_is_dear(sample):  # a GPU would have to be waited for
         low, high = (int(value) for value in sample.aminmax())
         if low < 0 or high >= batch_size:
             raise BeamboxError(
