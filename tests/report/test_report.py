@@ -212,6 +212,13 @@ def test_the_command_writes_page_numbers_and_pages_of_frames(
     ):
         refused = beambox(capsys, "report", weights, "--data", tmp_path / "kitti", *wrong)
         assert refused.status == 2 and message in refused.err
+    scored = beambox(capsys, "evaluate", weights, "--data", tmp_path / "kitti", "--classes", "Car",
+                     "--report", tmp_path / "e.html")  # fmt: skip
+    assert scored.status == 0, scored.err
+    tables = [
+        re.findall(r"<table>.*?</table>", (tmp_path / n).read_text(encoding="utf-8"))[0] for n in ("e.html", "r.html")
+    ]
+    assert tables[0] == tables[1], "both ways give one table of AP"
     (tmp_path / "results" / "000001.json").unlink()
     missing = beambox(
         capsys, "report", tmp_path / "results", "--data", tmp_path / "kitti", "--out", tmp_path / "x.html"

@@ -25,6 +25,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
     "track": ("beambox.cli.track:command", "follow objects through a drive: identities, velocities"),
+    "view": ("beambox.cli.view:command", "sweeps, boxes and cameras in the rerun viewer, live or as a file"),
+    "explain": ("beambox.cli.explain:command", "what the attention of HCNet, KASSD or DenNet looks at, as pictures"),
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),

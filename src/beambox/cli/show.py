@@ -29,9 +29,7 @@ __all__ = ["command"]
 def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     inputs: Annotated[
         list[str],
-        typer.Argument(
-            metavar="INPUT", help="Sweeps: files, folders, patterns, recordings; or a data set (YAML)."
-        ),
+        typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns, recordings; or a data set (YAML)."),
     ],
     out: Annotated[
         Path,
