@@ -180,7 +180,7 @@ def train(
 
     Args:
         recipe: the name of a shipped recipe (:func:`recipes` lists them), a YAML file, or a recipe that was read.
-        data: folder that ``{data}`` stands for in the recipe.
+        data: what ``{data}`` stands for in the recipe: a folder, or the YAML file of data of one's own.
         out: folder of the run; ``runs/NAME`` where None. It gets ``best.safetensors``, ``final.safetensors``,
             ``last.safetensors`` (to go on from), ``log.jsonl`` and ``tensorboard/``.
         overrides: changes of the recipe, such as ``"optim.lr=0.001"``; only with a file.
@@ -200,8 +200,9 @@ def train(
         raise BeamboxError("`overrides` change a recipe that is read from a file; change this one itself")
     stages = [recipe] if isinstance(recipe, Recipe) else read_stages(recipe, overrides)
     folder = None if data is None else Path(data)
-    if folder is not None and not folder.is_dir():
-        raise MissingFileError(f"--data: there is no folder {folder}")
+    if folder is not None and not folder.exists():
+        kind = "file" if folder.suffix in (".yaml", ".yml") else "folder"
+        raise MissingFileError(f"--data: there is no {kind} {folder}")
     return train_stages(stages, folder, Path(out) if out is not None else Path("runs") / stages[-1].name, resume)
 
 

@@ -41,8 +41,9 @@ def command(
         print(report(chosen, {}), end="")
         return
     wanted = parse_seeds(seeds)
-    if data is not None and not data.is_dir():
-        raise MissingFileError(f"--data: there is no folder {data}")
+    if data is not None and not data.exists():
+        kind = "file" if data.suffix in (".yaml", ".yml") else "folder"
+        raise MissingFileError(f"--data: there is no {kind} {data}")
 
     from beambox.cli.console import say
     from beambox.train.ablation import Interrupted, report, run_table, to_json

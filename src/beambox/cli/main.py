@@ -7,8 +7,10 @@ import functools
 import inspect
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 from beambox import __version__
@@ -159,8 +161,26 @@ def run(name: str, arguments: Sequence[str]) -> None:
         app.command(name, help=help_of(command), context_settings=settings)(guard(command))
     from beambox.cli.console import plain_output
 
-    with plain_output():
+    with plain_output(), terminated_as_interrupted():
         app(args=list(arguments), prog_name=f"beambox {name}")
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM, as a batch system sends it, end a command the way Ctrl-C does: files whole, drafts removed."""
+
+    def interrupt(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    try:
+        former = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not in the main thread, where signals do not arrive
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
 
 
 def help_of(function: Callable[..., None]) -> str:

@@ -83,51 +83,67 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
 
     from beambox.cli import show_inputs
     from beambox.geometry.axes import Axes
-    from beambox.infer.predictor import load
-    from beambox.visualise.scene import Scene
 
     show_log()
     turned = Axes.parse(axes) if axes else Axes()
     shown = region_of_option(area)
     source = show_inputs.data_set_of(inputs, split)
-    if source is None:
-        sweeps = show_inputs.of_files(inputs, frame, frames, fields or None, intensity_scale, not labels)
-    else:
-        sweeps = show_inputs.of_data_set(source, frame, frames)
+    sweeps = show_inputs.sweeps_of(
+        inputs, source, frame, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
+    )
     paths = picture_paths(sweeps, out)
-    own_range, own_height = show_inputs.looks_of(source)
-    detector = None
-    if model:
-        detector = load(
-            model,
-            device=device,
-            precision=precision,
-            range=options.parse_range(range_) or own_range,
-            view=view,  # pyright: ignore[reportArgumentType]  # load checks it
-            sensor_height=own_height if sensor_height is None else sensor_height,
-            axes=turned,
-            ground_slope=options.parse_slope(ground_slope),
-            intensity_scale=intensity_scale,
-            fields=fields or None,
-        )
+    detector = show_inputs.detector_for(
+        model,
+        source,
+        device=device,
+        precision=precision,
+        range=options.parse_range(range_),
+        view=view,
+        sensor_height=sensor_height,
+        axes=turned,
+        ground_slope=options.parse_slope(ground_slope),
+        intensity_scale=intensity_scale,
+        fields=fields or None,
+    )
 
     def scenes() -> Iterator[Scene]:
         for sweep in progress(sweeps, len(sweeps), "Drawing"):
-            read = sweep.read()
-            truth = truth_of(read, labels)
-            detections = found_in(read, detector, results)
-            read = read if detector is None else detector.crop(read)
-            yield Scene(*forward_up(read, detections, truth, turned))
+            yield scene_of(sweep.read(), detector, results, labels, turned)
 
-    if out.suffix.lower() == ".html":
-        write_scenes(out, scenes(), min_score, rate)
-    elif out.suffix.lower() in FILMS:
-        write_film(out, film_pictures(scenes(), detector, shown, colour, min_score), rate)
-    else:
-        write_pictures(paths, sweeps, (picture_of(one, detector, shown, colour, min_score) for one in scenes()))
+    write_all(out, paths, sweeps, scenes(), detector, shown, colour, min_score, rate)
 
 
 FILMS = (".gif", ".webp", ".mp4")
+
+
+def scene_of(frame: Frame, detector: Detector | None, results: Path | None, labels: str, axes: Axes) -> Scene:
+    """Return what is known of a sweep, forward up."""
+    from beambox.visualise.scene import Scene
+
+    truth = truth_of(frame, labels)
+    detections = found_in(frame, detector, results)
+    frame = frame if detector is None else detector.crop(frame)
+    return Scene(*forward_up(frame, detections, truth, axes))
+
+
+def write_all(
+    out: Path,
+    paths: Sequence[Path],
+    sweeps: Sequence[Shown],
+    scenes: Iterator[Scene],
+    detector: Detector | None,
+    shown: Region | None,
+    colour: str,
+    min_score: float,
+    rate: float,
+) -> None:
+    """Write the page, the film or the pictures."""
+    if out.suffix.lower() == ".html":
+        write_scenes(out, scenes, min_score, rate)
+    elif out.suffix.lower() in FILMS:
+        write_film(out, film_pictures(scenes, detector, shown, colour, min_score), rate)
+    else:
+        write_pictures(paths, sweeps, (picture_of(one, detector, shown, colour, min_score) for one in scenes))
 
 
 def check_choices(colour: str, model: str, results: Path | None) -> None:

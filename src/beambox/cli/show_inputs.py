@@ -6,16 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from beambox.checks import BeamboxError, did_you_mean
 
 if TYPE_CHECKING:
-    from beambox.data.custom import CustomSource
     from beambox.data.source import FrameSource
+    from beambox.infer.predictor import Detector
     from beambox.structures import Frame
 
-__all__ = ["Shown", "data_set_of", "of_data_set", "of_files"]
+__all__ = ["Shown", "data_set_of", "detector_for", "sweeps_of"]
 
 
 @dataclass(frozen=True)
@@ -91,13 +91,38 @@ def of_files(
     return [Shown(sweep.name, partial(read, sweep)) for sweep in sweeps]
 
 
-def looks_of(source: FrameSource | None) -> tuple[list[float] | float | None, float | None]:
-    """Return the range and the sensor's height that a data set's description names for detection in its frames."""
+def sweeps_of(
+    inputs: Sequence[str],
+    source: FrameSource | None,
+    names: str,
+    most: int,
+    *,
+    fields: str = "",
+    intensity_scale: float | None = None,
+    labels: bool = True,
+) -> list[Shown]:
+    """List what to draw: frames of a data set where one was named, else sweeps; see :func:`of_data_set`."""
+    if source is not None:
+        return of_data_set(source, names, most)
+    return of_files(inputs, names, most, fields or None, intensity_scale, labels)
+
+
+def detector_for(model: str, source: FrameSource | None, **options: Any) -> Detector | None:
+    """Load a detector as :func:`beambox.load` does; a data set's description says its range and its sensor's height.
+
+    Args:
+        model: name or path; None is returned where it is empty.
+        source: the data set, where one was named.
+        options: of :func:`beambox.load`; a range and a height that are given go before the description's.
+    """
     from beambox.data.custom import CustomSource
     from beambox.data.custom_config import KITTI_GROUND
+    from beambox.infer.predictor import load
 
-    if not isinstance(source, CustomSource):
-        return None, None
-    own: CustomSource = source
-    height = None if own.config.sensor_height is None else -KITTI_GROUND
-    return list(own.config.range) if own.config.range else None, height
+    if not model:
+        return None
+    if isinstance(source, CustomSource):
+        options["range"] = options.get("range") or source.config.range
+        if options.get("sensor_height") is None and source.config.sensor_height is not None:
+            options["sensor_height"] = -KITTI_GROUND  # its frames are shifted so that the ground lies there
+    return load(model, **options)

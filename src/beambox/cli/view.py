@@ -56,30 +56,26 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     check_rate(rate)
     expect_inputs(inputs)
 
-    from beambox.infer.predictor import load
     from beambox.infer.score_map import detect_with_scores
     from beambox.visualise.rerun_log import RerunLog, import_rerun
 
     show_log()
     import_rerun()
     source = show_inputs.data_set_of(inputs, split)
-    if source is None:
-        sweeps = show_inputs.of_files(inputs, frame, frames, fields or None, intensity_scale, not labels)
-    else:
-        sweeps = show_inputs.of_data_set(source, frame, frames)
-    own_range, own_height = show_inputs.looks_of(source)
-    detector = None
-    if model:
-        detector = load(
-            model,
-            device=device,
-            precision=precision,
-            range=options.parse_range(range_) or own_range,
-            view=view,  # pyright: ignore[reportArgumentType]  # load checks it
-            sensor_height=own_height if sensor_height is None else sensor_height,
-            intensity_scale=intensity_scale,
-            fields=fields or None,
-        )
+    sweeps = show_inputs.sweeps_of(
+        inputs, source, frame, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
+    )
+    detector = show_inputs.detector_for(
+        model,
+        source,
+        device=device,
+        precision=precision,
+        range=options.parse_range(range_),
+        view=view,
+        sensor_height=sensor_height,
+        intensity_scale=intensity_scale,
+        fields=fields or None,
+    )
     log = RerunLog(out, colour_by="height" if colour == "height" else "intensity")
     for number, sweep in enumerate(progress(sweeps, len(sweeps), "Detecting" if model else "Reading")):
         read, scores = sweep.read(), None
