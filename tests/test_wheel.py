@@ -154,7 +154,11 @@ def test_the_wheel_holds_what_it_needs_and_nothing_else(wheel: Path) -> None:
     assert {
         "beambox/py.typed",
         "beambox/recipes/shipped/pointpillars-sim.yaml",
-        "beambox/visualise/viewer.html",
+        "beambox/visualise/scene.html",
+        "beambox/visualise/scene.js",
+        "beambox/visualise/vendor/three-0.187.0.min.js",
+        "beambox/visualise/vendor/three.LICENSE",
+        "beambox/report/report.html",
     } <= names
     assert {name.split("/")[0] for name in names} == {"beambox", metadata.split("/")[0]}
     assert {"licenses/LICENSE", "licenses/NOTICE"} <= {name.split("/", 1)[1] for name in names if "dist-info" in name}
