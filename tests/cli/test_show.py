@@ -187,7 +187,8 @@ def test_show_draws_a_data_set_of_ones_own_with_its_labels(capsys: Capture, weig
     ran = beambox(capsys, "show", described, "--frames", "2", "--out", tmp_path / "pictures", "--area", "45")
     assert ran.status == 0, ran.err
     assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == ["00.png", "01.png"]
-    bare = beambox(capsys, "show", described, "--frame", "00", "--labels", "none", "--area", "45", "--out", tmp_path / "b.png")
+    options = ("--frame", "00", "--labels", "none", "--area", "45", "--out", tmp_path / "b.png")
+    bare = beambox(capsys, "show", described, *options)
     assert bare.status == 0, bare.err
     with_labels, without = (np.asarray(Image.open(p)) for p in (tmp_path / "pictures" / "00.png", tmp_path / "b.png"))
     green = [(np.abs(each.astype(int) - (94, 234, 140)).sum(axis=-1) < 60).sum() for each in (with_labels, without)]

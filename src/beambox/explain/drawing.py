@@ -15,7 +15,7 @@ from torch import Tensor
 
 from beambox.geometry import VoxelGrid, corners_bev
 
-__all__ = ["Explained", "draw_bars", "draw_maps", "draw_near"]
+__all__ = ["Explained", "draw_bars", "draw_maps", "draw_near", "scatter_map"]
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,7 @@ def _dennet(detector: Detector, batch: Batch, min_score: float) -> Iterator[Expl
 
 
 def _attended(layer: NeighborhoodAttention, pixels: Tensor, grid: Any, box: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Return places ``(L * L, 2)``, metres, that the cell at a box's middle attends to, their weights, a cell's edge."""
+    """Return places ``(L * L, 2)``, metres, that the cell at a box's middle attends to, weights, a cell's edge."""
     height, width, channels = pixels.shape[1:]
     edge = (grid.maximum[0] - grid.minimum[0]) / width
     column = min(width - 1, max(0, math.floor((float(box[0]) - grid.minimum[0]) / edge)))

@@ -23,6 +23,7 @@ from beambox.infer.predictor import Detector, View, find_weights, load
 from beambox.infer.results import find_result, read_result
 from beambox.io import read_text, write_text
 from beambox.metrics.kitti import KittiFrame
+from beambox.progress import track
 from beambox.report.failures import Picture, draw_failures, worst
 from beambox.report.measure import Measured, PointCounts, TimedDetect, measure
 from beambox.report.page import report_html
@@ -85,12 +86,13 @@ def measured(given: str, source: FrameSource, options: Options) -> Measured:
     about = about_data(options.data, options.split)
     if is_results(given):
         found = _read_results(Path(given), source)
-        frames = scored_frames(counts.watch(found))
+        frames = scored_frames(track(counts.watch(found), len(source), "reading"))
         known = dict.fromkeys(name for frame in frames for name in frame.detections.classes)
         classes, about = tuple(known), {"results": Path(given).name, **about}
     else:
         detect, classes, more = _detector(given, source, options)
-        frames = scored_frames(counts.watch(detect_frames(detect, source, batch=options.batch)))
+        found = detect_frames(detect, source, batch=options.batch)
+        frames = scored_frames(track(counts.watch(found), len(source), "detecting"))
         about = {**more, **about}
         if detect.summary():
             about["latency, ms per frame"] = detect.summary()
@@ -225,7 +227,8 @@ def write_page(
     """
     first = all_of[0]
     failures = {name: worst(first.matches, name, most) for name in first.classes}
-    drawn = list(draw_failures(first, source, [one for some in failures.values() for one in some]))
+    some_of_all = [one for some in failures.values() for one in some]
+    drawn = list(track(draw_failures(first, source, some_of_all), len(some_of_all), "drawing"))
     pictures: dict[str, list[Picture]] = {name: [] for name in first.classes}
     for picture in drawn:
         pictures[picture.failure.name].append(picture)
