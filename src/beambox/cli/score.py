@@ -123,7 +123,7 @@ def tracking(
     calib: Annotated[Path, typer.Option(help="calib file, or folder of files with the labels' names")],
     classes: Annotated[str, typer.Option(help="classes to score, comma-separated")] = "Car,Pedestrian,Cyclist",
     overlap: Annotated[str, typer.Option(help="3d, bev, or 2d as KITTI's benchmark")] = "3d",
-    iou: Iou = "",
+    iou: IouOption = None,
     json: Json = None,
 ) -> None:
     """Score tracks in KITTI's format: HOTA, MOTA, AMOTA, identity switches.
@@ -136,12 +136,14 @@ def tracking(
 
     result = score_tracks(
         read_drives(labels, results, calib),
-        [name.strip() for name in classes.split(",") if name.strip()],
+        parse_classes(classes),
         overlap=overlap,  # pyright: ignore[reportArgumentType]  # score_tracks checks it
-        min_overlap=parse_overlaps(iou),
+        min_overlap=parse_overlaps(",".join(iou or [])),
     )
     print(result.table(), end="")
     if json is not None:
+        from beambox.io import write_json
+
         write_json(json, result.to_json())
 
 
