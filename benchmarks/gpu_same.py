@@ -26,7 +26,7 @@ def recipe_of(name: str) -> Any:
     """Return a detector's recipe for KITTI, with all the width it has."""
     from beambox.train.config import read_recipe
 
-    return read_recipe(ROOT / "recipes" / f"{name.replace('_', '')}_kitti.yaml")
+    return read_recipe(f"{name}-kitti-3class")
 
 
 def full_width(name: str) -> nn.Module:

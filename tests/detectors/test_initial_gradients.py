@@ -10,7 +10,7 @@ import torch
 from beambox.detectors.hcnet import HeightChannelFusion, HeightChannelKind
 from beambox.detectors.kassd import KassdConfig, LamReduce, kassd
 from beambox.detectors.kassd.network import LocationAttention
-from beambox.train.config import read_recipe
+from beambox.train.stages import read_stages
 
 SEEDS = range(40)
 ROOT = Path(__file__).resolve().parents[2]
@@ -71,7 +71,7 @@ def test_kassds_priors_hold_behind_llm() -> None:
 def test_kam_learns_the_overlap_at_which_it_is_scored() -> None:
     checked = 0
     for path in sorted({*(ROOT / "recipes").rglob("kassd*.yaml"), *(ROOT / "src").rglob("recipes/**/kassd*.yaml")}):
-        recipe = read_recipe(path)
+        recipe = read_stages(path)[-1]
         if recipe.validation is None:
             continue
         options = recipe.detector.options

@@ -221,7 +221,7 @@ TABLES: dict[str, Table] = {
     "kassd-weights": Table(
         title="KASSD, weights of the losses: as printed, and as every relative has them",
         protocol=KASSD_VAL,
-        recipe="kassd_kitti_car",
+        recipe="kassd-kitti-car",
         columns=CAR_3D_R11,
         rows=(
             Row("class 2, box 1", (90.14, 80.06, 78.91), {}),
