@@ -292,7 +292,7 @@ def sitting(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
 def main() -> None:
     began = time.monotonic()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("recipe", help="name of a shipped recipe, or a file")
+    parser.add_argument("recipe", help="name or file")
     parser.add_argument("--data", type=Path, required=True, help="packed file, or a folder in KITTI's layout")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=8.0, help="of everything, from the start of this program")

@@ -72,6 +72,7 @@ class Ours:
         """Time the parts of one pass in CPU seconds: maps, products, and products on rows that need no gathering."""
         from beambox.ops.sparse_conv import SparseTensor, kernel_map
         from beambox.ops.sparse_conv.cpu import multiply
+        from beambox.ops.sparse_conv.cpu_maps import block_pairs
 
         voxels = self.voxels
         x = SparseTensor.of(self.features, voxels.indices, voxels.shape, 1)
@@ -80,7 +81,7 @@ class Ours:
         for block in self.blocks():
             start = time.process_time()
             pairs = kernel_map(x.sites, block.conv.geometry)
-            blocks = pairs.blocks
+            blocks = pairs.kept(block_pairs)
             found = time.process_time()
             features = multiply(x.features, block.conv.weight.detach(), None, pairs)
             done = time.process_time()

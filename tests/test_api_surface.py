@@ -18,10 +18,18 @@ PUBLIC = (
     "Detector",
     "Frame",
     "KittiSource",
+    "Label",
     "Labels",
     "VoxelGrid",
+    "draw",
+    "evaluate",
+    "export",
     "load",
+    "open_dataset",
     "read_frame",
+    "recipes",
+    "simulate",
+    "train",
 )
 
 

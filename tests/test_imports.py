@@ -75,3 +75,18 @@ print("\\n".join(failed))
 @pytest.mark.parametrize("name", ["beambox", "beambox.cli.main", "beambox.checks"])
 def test_light_modules_import_alone(name: str) -> None:
     assert not loaded_after(f"import {name}") & HEAVY
+
+
+@pytest.mark.parametrize("command", ["detect", "show", "doctor"])
+def test_inputs_that_are_not_there_are_refused_before_torch_is_loaded(command: str) -> None:
+    statement = (
+        f"import beambox.cli.main as m\ntry:\n    m.main(['{command}', 'absent.bin'])\n"
+        "except SystemExit as stopped:\n    assert stopped.code == 2"
+    )
+    assert not loaded_after(statement) & {"torch", "numpy", "numba", "PIL"}
+
+
+def test_importing_beambox_takes_a_fifth_of_a_second_of_processor_time_at_most() -> None:
+    code = "import os\nbefore = os.times()\nimport beambox\nused = os.times()\n"
+    code += "print(used.user + used.system - before.user - before.system)"
+    assert min(float(run(code)) for _ in range(3)) < 0.2

@@ -49,8 +49,7 @@ def test_each_shipped_weight_has_a_recipe_of_its_name_and_network(name: str) -> 
     made = build(last.detector.name, last.detector.options)
     assert last.detector.name == stored.detector
     own = made.state_dict()
-    held = tensors_since(made, stored.tensors)
-    assert {key: tuple(value.shape) for key, value in held.items()} == {
+    assert {key: tuple(value.shape) for key, value in tensors_since(made, stored.tensors).items()} == {
         key: tuple(value.shape) for key, value in own.items()
     }
     assert made.config.smooth_l1_beta == stored.config["smooth_l1_beta"]

@@ -132,7 +132,8 @@ def desk(python: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run(python, folder, [*made, "detect kitti --model pointpillars-sim --format kitti --out results"])
     shutil.copytree(folder / "kitti" / "training" / "label_2", folder / "label_2")
     shutil.copy(ROOT / "src" / "beambox" / "zoo" / "pointpillars-sim.safetensors", folder / "run" / "best.safetensors")
-    shutil.copytree(folder / "kitti", folder / "DIR" / "kitti")
+    for copy in ("DIR/kitti", "KITTI"):
+        shutil.copytree(folder / "kitti", folder / copy)
     with tarfile.open(folder / "kitti_labels.tar.gz", "w:gz") as archive:
         for part in ("label_2", "calib"):
             archive.add(folder / "kitti" / "training" / part, f"training/{part}")

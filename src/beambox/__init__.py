@@ -3,6 +3,9 @@
 >>> import beambox
 >>> detector = beambox.load("pointpillars-sim")
 >>> detections = detector("scan.bin")
+>>> scores = beambox.evaluate("pointpillars-sim", "data")
+
+Everything public is an attribute of this module and loaded on first use. docs/reference.md lists it.
 """
 
 from __future__ import annotations
@@ -22,7 +25,15 @@ if TYPE_CHECKING:
     from beambox.structures import Detection as Detection
     from beambox.structures import Detections as Detections
     from beambox.structures import Frame as Frame
+    from beambox.structures import Label as Label
     from beambox.structures import Labels as Labels
+    from beambox.verbs import draw as draw
+    from beambox.verbs import evaluate as evaluate
+    from beambox.verbs import export as export
+    from beambox.verbs import open_dataset as open_dataset
+    from beambox.verbs import recipes as recipes
+    from beambox.verbs import simulate as simulate
+    from beambox.verbs import train as train
 
 __version__ = "0.1.0"
 
@@ -36,18 +47,26 @@ _PUBLIC = {
     "Detector": "beambox.infer.predictor",
     "Frame": "beambox.structures",
     "KittiSource": "beambox.data.kitti",
+    "Label": "beambox.structures",
     "Labels": "beambox.structures",
     "VoxelGrid": "beambox.geometry.grid",
+    "draw": "beambox.verbs",
+    "evaluate": "beambox.verbs",
+    "export": "",
     "load": "beambox.infer.predictor",
+    "open_dataset": "beambox.verbs",
     "read_frame": "beambox.data.reading",
-}
+    "recipes": "beambox.verbs",
+    "simulate": "",
+    "train": "",
+}  # "": a package of that name, which can be called
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'beambox' has no attribute {name!r}")
-    return getattr(import_module(_PUBLIC[name]), name)
+    return getattr(import_module(_PUBLIC[name]), name) if _PUBLIC[name] else import_module(f"beambox.{name}")
 
 
 def __dir__() -> list[str]:

@@ -136,7 +136,7 @@ def choose_fields(settings: Any) -> None:
 
 def did_you_mean(word: str, options: Iterable[str]) -> str:
     """Return `` (did you mean "x"?)`` for the nearest option, or the list of options where none is near."""
-    known = sorted(options)
+    known = sorted(str(option)[:LONGEST_WORD] for option in options)
     near = [] if len(word) > LONGEST_WORD else difflib.get_close_matches(word, known[:1000], n=1, cutoff=0.6)
     if near:
         return f' (did you mean "{near[0]}"?)'

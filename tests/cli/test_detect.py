@@ -187,3 +187,10 @@ def test_an_interrupt_keeps_what_is_done(
 @pytest.mark.parametrize("value", ["10,20", "wide", "1,2,3,4,5"])
 def test_ranges_that_cannot_be_read_are_refused(capsys: Capture, weights: Path, scan: Path, value: str) -> None:
     assert "--range takes one number, or four" in one_line(capsys, "detect", scan, "-m", weights, "--range", value)
+
+
+def test_without_a_model_the_free_weights_are_taken_and_named(capsys: Capture, scan: Path, tmp_path: Path) -> None:
+    ran = beambox(capsys, "detect", scan, "--out", tmp_path / "out")
+    assert ran.status == 0, ran.err
+    assert "no --model given: pointpillars-sim" in ran.err
+    assert json.loads((tmp_path / "out" / "scan.json").read_text())["model"] == "pointpillars-sim"

@@ -180,7 +180,7 @@ def test_splits_are_lists_of_names(folder: tuple[Path, str]) -> None:
         ({"clases": "[Car]"}, r'data\.yaml: unknown key "clases" \(did you mean "classes"\?\)'),
         ({"points": "velodyne"}, r"points must contain \{frame\}"),
         ({"format": ""}, r"format must say how boxes/\{frame\}\.txt is written"),
-        ({"format": "voc"}, r"format: Input should be 'kitti', 'once', 'pandaset', 'csv' or 'json'"),
+        ({"format": "voc"}, r"format: Input should be 'kitti', 'once', 'pandaset', 'csv', 'json', 'openpcdet'"),
         ({"classes": "{}"}, "classes must name at least one class"),
         ({"classes": "{A: Car, B: Car}"}, "the name 'Car' stands in A and in B"),
         ({"axes": '"x: forward, y: up"'}, "z must lead up or down"),

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.infer.benchmark import STAGES, Report, measure, summary
+from beambox.infer.benchmark import STAGES, Report, measure, summary, untrained
 from beambox.infer.predictor import load
+from oracles.command_line import beambox
 from oracles.tiny_detector import street, tiny_weights
 
 
@@ -75,3 +76,24 @@ def test_nothing_to_measure_is_refused(tmp_path: Path) -> None:
     detector = load(tiny_weights(tmp_path), device="cpu")
     with pytest.raises(BeamboxError, match="needs sweeps and at least 1 run"):
         measure(detector, [])
+
+
+def test_a_detector_is_timed_as_configured_without_trained_weights(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "small.yaml"
+    grid = {"minimum": [0, -16, -3], "maximum": [32, 16, 1], "cell": [0.2, 0.2, 0.1]}
+    options = {"grid": grid, "encoder_widths": [4, 4, 8, 8], "encoder_out": 8, "width": 8, "kam_width": 8}
+    recipe.write_text(json.dumps({"name": "small", "detector": {"name": "kassd", "options": options}}))
+    first, again = untrained(recipe, device="cpu"), untrained(recipe, device="cpu")
+    assert (first.model.config.width, first.model.config.kam) == (8, True)
+    assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), again.model.parameters()))
+    words = ("--config", "--protocol", "kassd", "--device", "cpu", "--warmup", 0)
+    told = beambox(capsys, "bench", recipe, *words).out
+    assert "untrained weights" in told and "42.9" in told
+    for name, message in (("kasd", r'did you mean "kassd"'), (tmp_path / "no.yaml", "there is no recipe")):
+        with pytest.raises(BeamboxError, match=message):
+            untrained(name)
+    recipe.write_text("[1, 2]")
+    with pytest.raises(BeamboxError, match="names no detector"):
+        untrained(recipe)

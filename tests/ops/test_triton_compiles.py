@@ -108,7 +108,7 @@ def test_sparse_convolution_compiles(values, bias, widths):
 
 
 def test_kernel_maps_compile():
-    from beambox.ops.sparse_conv import gpu_maps
+    from beambox.ops.sparse_conv import gpu_indices, gpu_maps
 
     level = dict.fromkeys(("nz", "ny", "nx"), "i32")
     other = dict.fromkeys(("tz", "ty", "tx"), "i32")
@@ -124,7 +124,7 @@ def test_kernel_maps_compile():
             gpu_maps._spread, source=source, active="*i8", count="i32", listed=listed, **level, **other, kz="i32",
             ky="i32", kx="i32", **steps, block=gpu_maps.BLOCK,
         )  # fmt: skip
-    compile_kernel(gpu_maps._take_apart, keys="*i64", order="*i64", indices="*i64", rows="i32", **level, block=256)
+    compile_kernel(gpu_indices._take_apart, keys="*i64", order="*i64", indices="*i64", rows="i32", **level, block=256)
 
 
 @pytest.mark.parametrize("values", ["*fp32", "*fp64"])

@@ -65,7 +65,7 @@ def test_own_sensor_from_yaml_is_cast(tmp_path) -> None:
         ("elevations: [95]\nheight: 2\nazimuth_step: 1\n", "between -90 and 90"),
         ("elevations: [1]\noffsets: [1, 2]\nheight: 2\nazimuth_step: 1\n", "must be empty or one a beam"),
         ("- 1\n", "must hold keys and values, got list"),
-        ("a: [1\n", "is not YAML"),
+        ("a: [1\n", "is not valid YAML"),
     ],
 )
 def test_bad_sensor_files_are_refused(tmp_path, text: str, message: str) -> None:

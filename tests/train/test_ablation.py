@@ -19,7 +19,8 @@ from beambox.train import ablation
 from beambox.train.ablation import Interrupted, Timed, merged, report, row_recipe, run_table, to_json, value_at
 from beambox.train.config import Recipe, parse_recipe, read_recipe
 from beambox.train.sources import open_source, shared_database
-from beambox.train.tables import TABLES, Column, Row, Table, levels, read_table, table_of
+from beambox.train.table_file import read_table
+from beambox.train.tables import TABLES, Column, Row, Table, levels, table_of
 from oracles import tiny_training
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -244,10 +245,10 @@ def test_columns_find_their_numbers_in_a_kitti_result() -> None:
         return tuple(AveragePrecision(first + i, first + 10 + i, 0.0, ()) for i in range(3))
 
     car = ClassResult("Car", 0.7, (9, 9, 9), averages(10), averages(30), averages(50), averages(70))
-    scores = KittiResult((car,), ("easy", "moderate", "hard"), 5).to_json()
+    scores = {**KittiResult((car,), ("easy", "moderate", "hard"), 5).to_json(), "time": {"ms": 32.0}}
     table = table_of("hcnet-table2")
     found = [value_at(scores, column.path) for column in table.columns]
-    assert found == [30, 31, 32, 10, 11, 12, 70, 71, 72]
+    assert found == [30, 31, 32, 10, 11, 12, 70, 71, 72, 32.0]
     assert [value_at(scores, c.path) for c in levels("Car", "3d", "R11")] == [20, 21, 22]
     assert value_at(scores, ("Cyclist", "3d", "R11", 0)) is None
 
@@ -372,3 +373,17 @@ def test_a_broken_table_is_refused(text: str, message: str, tmp_path: Path) -> N
     with pytest.raises(BeamboxError, match=message):
         read_table(tmp_path / "mine.yaml")
     assert "one of the two" in str(run_command().exception)
+
+
+def test_the_papers_tables_hold_what_they_print() -> None:
+    def row(table: str, name: str) -> tuple[float | None, ...]:
+        return next(row.published for row in table_of(table).rows if row.name == name)
+
+    assert row("dennet-table1", "DenNet") == (90.72, 81.93, 77.48, 46.10, 40.23, 33.47, 78.89, 64.15, 56.81)
+    assert row("dennet-table2", "Voxel R-CNN") == (92.86, 85.13, 82.84, 69.37, 61.56, 56.39, 91.63, 74.52, 70.25)
+    assert row("dennet-table2", "PV-RCNN") == row("dennet-table1", "PV-RCNN"), "as printed, and remarked upon"
+    assert row("kassd-table1", "KASSD") == (88.92, 79.75, 72.17) and len(table_of("kassd-table1").rows) == 18
+    assert row("kassd-table2", "CIA-SSD") == (90.04, 79.81, 78.80) and len(table_of("kassd-table2").rows) == 22
+    assert [r.published for r in table_of("kassd-table7").rows] == [(643.0,), (60.0,), (46.3,), (38.0,), (45.9,)]
+    assert row("hcnet-table1", "PointPillars") == (87.50, 77.01, 74.77, 16.0)
+    assert row("hcnet-table2", "HCNet")[-1] == 32.0

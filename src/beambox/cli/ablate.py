@@ -35,7 +35,8 @@ def command(
     All rows share one recipe and one list of seeds and differ in their switches alone. Interrupted, the same command
     goes on where it stopped.
     """
-    from beambox.train.tables import read_table, table_of
+    from beambox.train.table_file import read_table
+    from beambox.train.tables import table_of
 
     if bool(table) == (table_file is not None):
         raise BeamboxError("name one of the papers' tables, or give a file with --table; one of the two")
@@ -46,8 +47,9 @@ def command(
         print(report(chosen, {}), end="")
         return
     wanted = parse_seeds(seeds)
-    if data is not None and not data.is_dir():
-        raise MissingFileError(f"--data: there is no folder {data}")
+    if data is not None and not data.exists():
+        kind = "file" if data.suffix in (".yaml", ".yml") else "folder"
+        raise MissingFileError(f"--data: there is no {kind} {data}")
 
     from beambox.cli.console import say
     from beambox.train.ablation import Interrupted, report, run_table, to_json

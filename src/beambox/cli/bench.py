@@ -28,6 +28,10 @@ def command(
         str, typer.Option(help="stages, or kassd: three parts, mean of ten runs, as in its Table 7.")
     ] = "stages",
     json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="Write the numbers here.")] = None,
+    config: Annotated[
+        bool,
+        typer.Option("--config", help="MODEL is a detector's name, or a recipe: time it untrained, as configured."),
+    ] = False,
     range_: options.RangeOption = "",
     device: options.DeviceOption = "auto",
     precision: options.PrecisionOption = "auto",
@@ -38,13 +42,14 @@ def command(
       beambox bench pointpillars-sim
       beambox bench run/best.safetensors kitti/training/velodyne/000008.bin --threads 2 --json bench.json
       beambox bench pointpillars-sim --protocol kassd
+      beambox bench kassd --config --protocol kassd
     """
     import json
     import tempfile
 
     import torch
 
-    from beambox.infer.benchmark import measure
+    from beambox.infer.benchmark import measure, untrained
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
     from beambox.io import write_text
@@ -54,7 +59,12 @@ def command(
         raise BeamboxError(f'unknown protocol "{protocol}"{did_you_mean(protocol, ["stages", "kassd"])}')
     if threads:
         torch.set_num_threads(threads)
-    detector = load(model, device=device, precision=precision, range=options.parse_range(range_))
+    if config and range_:
+        raise BeamboxError("--range is for trained weights; with --config, give a recipe with the wanted grid")
+    if config:
+        detector = untrained(model, device=device, precision=precision)
+    else:
+        detector = load(model, device=device, precision=precision, range=options.parse_range(range_))
     announce("bench", detail=model, seed=None if inputs else 0)
     with tempfile.TemporaryDirectory() as folder:
         paths = [sweep.path for sweep in find_sweeps(inputs)] if inputs else [simulated_sweep(Path(folder))]
@@ -66,6 +76,8 @@ def command(
         f"{model} on {told['device']}, {told['precision']}, {told['threads']} threads, batch {told['batch']}, "
         f"{told['points']:,} points, {told['runs']} runs after {told['warmup']}"
     )
+    if config:
+        print("untrained weights: hardly any box is found, so post-processing is shorter than it will be")
     print(report.kassd_table() if protocol == "kassd" else report.table())
     load_average, cores = told["load_average"], os.cpu_count() or 1
     if load_average is not None and load_average > 0.5 * cores:

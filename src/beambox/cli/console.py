@@ -6,14 +6,13 @@ import contextlib
 import logging
 import sys
 from collections.abc import Iterable, Iterator
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO
 
 from beambox import __version__
 from beambox.checks import printable
+from beambox.progress import track as progress
 
 __all__ = ["LONGEST_LINE", "announce", "plain", "plain_output", "progress", "say", "show_log"]
-
-T = TypeVar("T")
 
 LONGEST_LINE = 2000
 """Characters of a message; a file can hold a name of any length."""
@@ -72,17 +71,6 @@ def announce(command: str, *, seed: int | None = None, detail: str = "") -> None
     parts += [f"seed {seed}"] if seed is not None else []
     parts += [detail] if detail else []
     say(", ".join(parts))
-
-
-def progress(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """Yield items, behind a bar on stderr where that is a terminal and there is more than one."""
-    if total < 2 or not sys.stderr.isatty():
-        yield from items
-        return
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(items, description=what, total=total, console=Console(stderr=True))
 
 
 def show_log(level: int = logging.WARNING) -> None:

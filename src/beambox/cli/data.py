@@ -1,4 +1,4 @@
-"""`beambox data check|anchors|voxels|splits`: look at a data set before training on it."""
+"""`beambox data check|anchors|voxels|splits|convert`: look at a data set before training on it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Look at a data set: read all of it and say what seems wrong, propose anchors, count points, write lists.",
+    help="Look at a data set: say what seems wrong, propose anchors, count points; write lists, convert labels.",
 )
 
 DATA = Annotated[Path, typer.Argument(metavar="DATA", help="YAML file of a data set, or a KITTI or ONCE folder.")]
@@ -129,6 +129,36 @@ def splits(
         print(f"{folder / 'ImageSets' / name}.txt: {count} frames")
 
 
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Label file, or folder of label files.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File or folder to write.")],
+    kind: Annotated[str, typer.Option("--from", metavar="F", help="Format of the source.")],
+    wanted: Annotated[str, typer.Option("--to", metavar="F", help="Format to write.")],
+    calib: Annotated[Path | None, typer.Option(help="For KITTI: calib file, or folder of FRAME.txt.")] = None,
+    degrees: Annotated[
+        bool | None, typer.Option("--degrees/--radians", help="Angles of the source, where not as usual.")
+    ] = None,
+) -> None:
+    """Turn labels of one annotation tool into those of another.
+
+    Examples:
+      beambox data convert labels --from labelcloud --to openpcdet --out custom/labels
+      beambox data convert export.json --from datumaro --to kitti --calib calib --out label_2
+      beambox data convert detections --from json --to sustechpoints --out scene/label
+
+    Formats: openpcdet, mmdet3d, sustechpoints, labelcloud (degrees), labelcloud_rel (radians), labelcloud_vertices,
+    supervisely, datumaro (CVAT), segments, scale, openlabel, pandaset_columns, table (CSV with any usual names), kitti;
+    read only: pandaset, once, csv, json (as `beambox detect` writes them).
+    """
+    from beambox.cli.console import say
+    from beambox.data.labels.convert import convert_labels
+
+    frames, notes = convert_labels(source, kind, out, wanted, calib=calib, degrees=degrees)
+    for note in notes:
+        say(f"note: {note}")
+    print(f"{sum(map(len, frames.values()))} boxes of {len(frames)} frames -> {out}")
+
+
 def spread(total: int, wanted: int | None) -> list[int]:
     """Return the positions of ``wanted`` frames, spread evenly over all; all of them where None."""
     if wanted is None or wanted >= total:
@@ -136,5 +166,5 @@ def spread(total: int, wanted: int | None) -> list[int]:
     return [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
 
 
-for function in (check, anchors, voxels, splits):
+for function in (check, anchors, voxels, splits, convert):
     app.command(help=help_of(function))(guard(function))

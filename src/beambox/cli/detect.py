@@ -16,14 +16,19 @@ from beambox.cli.console import announce, progress, say, show_log
 if TYPE_CHECKING:
     from beambox.infer.inputs import Sweep
     from beambox.infer.predictor import Detector
-    from beambox.structures import Detections
+    from beambox.structures import Detections, Frame
 
 __all__ = ["command"]
+
+UNSEEN = 0.2
+"""Share of the points from which it is said that the network does not look at them."""
+REACH = 75.0
+"""Points farther than this to a side are no loss, metres."""
 
 
 def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     inputs: options.InputsArgument,
-    model: options.ModelOption,
+    model: options.DefaultModelOption = "",
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
         "detections"
     ),
@@ -42,7 +47,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     """Find objects in sweeps; writes one result file a sweep.
 
     Examples:
-      beambox detect scan.bin --model pointpillars-sim
+      beambox detect scan.bin
       beambox detect kitti/training/velodyne --model run/best.safetensors --format kitti --out results
       beambox detect "drive/*.pcd" -m pointpillars-sim --range 50 --sensor-height 1.9 --axes "x: right, y: forward"
 
@@ -50,6 +55,15 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     format needs the sweep's calibration, found as ../calib/ID.txt beside velodyne/ID.bin. Nothing found at all?
     `beambox doctor scan.bin --model M` says why.
     """
+    from beambox.data.existence import expect_inputs
+    from beambox.zoo import DEFAULT
+
+    expect_inputs(inputs)  # before torch is loaded, which takes seconds
+    parsed_range, slope = options.parse_range(range_), options.parse_slope(ground_slope)
+    if not model:
+        model = DEFAULT
+        say(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
+
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
     from beambox.infer.results import choose_formats
@@ -63,11 +77,11 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         model,
         device=device,
         precision=precision,
-        range=options.parse_range(range_),
+        range=parsed_range,
         view=view,  # pyright: ignore[reportArgumentType]  # load checks it
         sensor_height=sensor_height,
         axes=axes or None,
-        ground_slope=options.parse_slope(ground_slope),
+        ground_slope=slope,
         intensity_scale=intensity_scale,
         fields=fields or None,
     )
@@ -96,8 +110,11 @@ def detect_all(
             told = True
         for note in frame.notes:
             say(f"{sweep.name}: {note}")
+        if not told and (hint := unseen(detector, frame)):
+            say(hint)
+            told = True
         detections = detector.detect([frame])[0]
-        detections = detections[detections.scores >= min_score]
+        detections = detections.above(min_score)
         written = write_results(out, frame, detections, kinds, model, sweep.name)
         found += len(detections)
         print(f"{sweep.name}: {counted(detections)} -> {', '.join(str(path) for path in written)}")
@@ -107,6 +124,23 @@ def detect_all(
         say(f"nothing found; `beambox doctor {sweeps[0].path} --model {model}` says why")
     if failed:
         raise BeamboxError(f"{failed} of {len(sweeps)} sweeps could not be read; the others are done")
+
+
+def unseen(detector: Detector, frame: Frame) -> str:
+    """Say how much of a sweep lies where the network does not look, and what to do; empty where that is little."""
+    prepared = detector.prepare(frame)
+    low, high = detector.grid.minimum, detector.grid.maximum
+    xy = prepared.points[:, :2]
+    near = xy.abs().amax(dim=1) <= REACH
+    outside = near & ((xy[:, 0] < low[0]) | (xy[:, 0] >= high[0]) | (xy[:, 1] < low[1]) | (xy[:, 1] >= high[1]))
+    share = float(outside.sum()) / max(1, len(xy))
+    if share < UNSEEN:
+        return ""
+    told = (
+        f"{share:.0%} of the points lie where the network does not look (x {low[0]:g} to {high[0]:g}, y {low[1]:g} to "
+        f"{high[1]:g} m): --range 50 looks all around"
+    )
+    return told + (", though these weights know only what lies there" if detector.config.absolute_xy else "")
 
 
 def counted(detections: Detections) -> str:

@@ -43,6 +43,10 @@ def command(
 
         report(environment())
         return
+    from beambox.data.existence import expect_inputs
+
+    expect_inputs(inputs)
+
     from beambox.detectors.pointpillars import KITTI_PILLARS
     from beambox.infer.doctor import examine
     from beambox.infer.inputs import find_sweeps

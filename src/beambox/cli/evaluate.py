@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,8 +22,6 @@ from beambox.cli.options import (
 
 if TYPE_CHECKING:
     from beambox.data.source import FrameSource
-    from beambox.infer.predictor import Detector
-    from beambox.structures import Detections, Frame
 
 __all__ = ["command"]
 
@@ -60,84 +57,41 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     Data without a camera have no difficulty levels: every object counts, and each class has one AP. Data of one's own
     are looked at within the range that their YAML file names. After the AP follow the errors of the matched boxes.
     """
-    from beambox.cli.console import progress
-    from beambox.data.custom import CustomSource
-    from beambox.data.custom_config import KITTI_GROUND
-    from beambox.data.once import OnceSource
-    from beambox.data.opening import open_data
-    from beambox.infer.evaluate import check_classes, evaluate_frames, scored_frames
-    from beambox.infer.predictor import load
     from beambox.io import write_json
     from beambox.metrics.rounds import parse_rounds
+    from beambox.verbs import evaluate, open_dataset
 
     rounds = parse_rounds(iou or [])
-    source = open_data(data, split)
-    by_once = isinstance(source, OnceSource)
-    if published and not by_once:
-        raise BeamboxError("--published prints the rows of a table on ONCE; these data are not of ONCE's layout")
-    if results is not None and source[0].calibration is None:
-        raise BeamboxError(
-            "--results writes KITTI result files, whose boxes live in a camera's frame, and the data have no "
-            "calibration; keep the detections with --keep FILE"
-        )
-    region, height = parse_range(range_), None
-    if isinstance(source, CustomSource):
-        region = region or source.config.range
-        height = None if source.config.sensor_height is None else -KITTI_GROUND
-    detector = load(
+    if published:
+        need_once(open_dataset(data, split))
+    scored = evaluate(
         model,
+        data,
+        split=split,
+        classes=parse_classes(classes) or None,
+        iou=rounds,
+        levels=not no_difficulty,
+        score_threshold=score_threshold,
+        results=results,
+        keep=keep,
+        batch_size=batch,
         device=device,
         precision=precision,
-        view=view,  # pyright: ignore[reportArgumentType]
-        range=region,
-        sensor_height=height,
-    )
-    wanted = parse_classes(classes) or list(detector.classes)
-    check_classes(wanted, rounds, by_once)
-    found = _found(detector, model, source, data, keep, batch, score_threshold)
-    frames = scored_frames(progress(_written(found, results), len(source), "detecting"))
-    scored = evaluate_frames(
-        frames,
-        wanted,
-        rounds,
-        by_once=by_once,
-        levels=not no_difficulty,
-        precision=str(detector.dtype).removeprefix("torch."),
+        range=parse_range(range_),
+        view=view,  # pyright: ignore[reportArgumentType]  # load checks it
     )
     print(scored.table(Path(model).stem, published))
     if json_file is not None:
         write_json(json_file, scored.to_json(), indent=2)
 
 
-def _found(
-    detector: Detector, model: str, source: FrameSource, data: Path, keep: Path | None, batch: int, threshold: float
-) -> Iterator[tuple[Frame, Detections]]:
-    """Detect, or take what was kept."""
-    from beambox.infer.evaluate import detect_frames
-    from beambox.infer.kept import KeptDetections, digest
-    from beambox.infer.predictor import find_weights
+def need_once(source: FrameSource) -> None:
+    """Refuse --published where the data are not ONCE's.
 
-    if keep is None:
-        return detect_frames(detector.detect, source, batch=batch, score_threshold=threshold)
-    made_by: dict[str, Any] = {
-        "model": Path(model).name,
-        "weights": digest(find_weights(model)),
-        "data": str(data.resolve()),
-        "precision": str(detector.dtype).removeprefix("torch."),
-        "range": [list(detector.grid.minimum), list(detector.grid.maximum)],
-        "view": detector.view,
-        "raised": detector.corrections.raise_by,
-        "score_threshold": threshold,
-    }
-    kept = KeptDetections(keep, made_by, detector.classes)
-    return kept.detect(detector.detect, source, batch=batch, score_threshold=threshold)
+    Raises:
+        BeamboxError: saying so.
+    """
+    from beambox.data.once import OnceSource
 
-
-def _written(found: Iterator[tuple[Frame, Detections]], folder: Path | None) -> Iterator[tuple[Frame, Detections]]:
-    """Write each frame's KITTI result file as soon as it is there."""
-    from beambox.infer.evaluate import write_result
-
-    for frame, detections in found:
-        if folder is not None:
-            write_result(folder, frame, detections)
-        yield frame, detections
+    if not isinstance(source, OnceSource):
+        raise BeamboxError("--published prints the rows of a table on ONCE; these data are not of ONCE's layout")

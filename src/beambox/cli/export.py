@@ -32,24 +32,16 @@ def command(
       beambox export pointpillars-kitti --out pointpillars.onnx
       beambox export run --out run.onnx --verify scan.bin --range 50
     """
-    from beambox.detectors.weights import load_weights, read_weights
     from beambox.export.onnx_check import TOLERANCE
-    from beambox.export.onnx_file import export_onnx, exportable
-    from beambox.infer.predictor import Detector, find_weights, region
+    from beambox.infer.cards import read_card
+    from beambox.infer.predictor import find_weights
+    from beambox.verbs import export
 
     show_log()
     announce("export", detail=model)
-    path = find_weights(model)
-    network = exportable(load_weights(path))
-    wanted = options.parse_range(range_)
-    grid = network.config.grid if wanted is None else region(network.config.grid, wanted)
-    sweeps = {}
-    if sweep:
-        reader = Detector(network, device="cpu", precision="float32", grid=grid)
-        sweeps = {sweep: reader.prepare(reader.read(sweep)).points}
-    card = read_weights(path).card
-    written = export_onnx(network, out, grid=grid, opset=opset, card=card, sweeps=sweeps)
-    print(f"{out}: {model} ({', '.join(network.config.classes)}), {written.size / 1e6:.1f} MB, opset {opset}")
+    classes = read_card(find_weights(model)).classes
+    written = export(model, out, range=options.parse_range(range_), opset=opset, verify=sweep or None)
+    print(f"{out}: {model} ({', '.join(classes)}), {written.size / 1e6:.1f} MB, opset {opset}")
     print("  in   " + ", ".join(f"{name} {shape}" for name, shape in written.inputs.items()))
     print("  out  " + ", ".join(f"{name} {shape}" for name, shape in written.outputs.items()))
     for found in written.checks:

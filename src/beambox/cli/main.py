@@ -7,8 +7,10 @@ import functools
 import inspect
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 from beambox import __version__
@@ -24,6 +26,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
+    "track": ("beambox.cli.track:command", "follow objects through a drive: identities, velocities"),
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
@@ -39,6 +42,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),
     "submit": ("beambox.cli.submit:command", "check result files for KITTI's test server and pack them"),
     "export": ("beambox.cli.export:command", "write PointPillars or HCNet as an ONNX file, compared with PyTorch"),
+    "completion": ("beambox.cli.completion:command", "a script that completes commands and options in a shell"),
     "import-openpcdet": ("beambox.cli.import_openpcdet:command", "convert a checkpoint of OpenPCDet"),
     "score": ("beambox.cli.score:app", "score result files of any detector by the rules of KITTI or ONCE"),
 }
@@ -123,6 +127,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # torch's threads otherwise wait for their next piece of work in a loop of some ms, on a core that others want
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if os.environ.get("_BEAMBOX_WORDS"):
+        from beambox.cli.completion import complete
+
+        print("\n".join(complete(words)))
+        raise SystemExit(0)
     if not words or words[0] in ("-h", "--help", "help"):
         print(help_text())
         raise SystemExit(0)
@@ -153,8 +162,26 @@ def run(name: str, arguments: Sequence[str]) -> None:
         app.command(name, help=help_of(command), context_settings=settings)(guard(command))
     from beambox.cli.console import plain_output
 
-    with plain_output():
+    with plain_output(), terminated_as_interrupted():
         app(args=list(arguments), prog_name=f"beambox {name}")
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM, as a batch system sends it, end a command the way Ctrl-C does: files whole, drafts removed."""
+
+    def interrupt(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    try:
+        former = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not in the main thread, where signals do not arrive
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
 
 
 def help_of(function: Callable[..., None]) -> str:

@@ -12,6 +12,7 @@ from beambox.checks import BeamboxError
 __all__ = [
     "AxesOption",
     "ClassesOption",
+    "DefaultModelOption",
     "DeviceOption",
     "FieldsOption",
     "HeightOption",
@@ -38,6 +39,15 @@ ModelArgument = Annotated[
 ]
 ModelOption = Annotated[
     str, typer.Option("--model", "-m", metavar="M", help="Shipped name, .safetensors file, or folder of a run.")
+]
+DefaultModelOption = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        "-m",
+        metavar="M",
+        help="Shipped name, .safetensors file, or folder of a run; pointpillars-sim if none.",
+    ),
 ]
 DeviceOption = Annotated[str, typer.Option(help="cpu, cuda, cuda:0; auto takes the GPU where there is one.")]
 PrecisionOption = Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16.")]

@@ -1,4 +1,4 @@
-"""`beambox score kitti|once`: score result files without running a detector."""
+"""`beambox score kitti|once|tracking`: score result files without running a detector."""
 
 from __future__ import annotations
 
@@ -117,5 +117,35 @@ def once(
     conclude(scored, [result.table(published=published) for result in scored], json)
 
 
-for function in (kitti, once):
+def tracking(
+    labels: Annotated[Path, typer.Option(help="label file of a drive, or folder of label files, one a drive")],
+    results: Annotated[Path, typer.Option(help="tracks of the drive, or folder of files with the labels' names")],
+    calib: Annotated[Path, typer.Option(help="calib file, or folder of files with the labels' names")],
+    classes: Annotated[str, typer.Option(help="classes to score, comma-separated")] = "Car,Pedestrian,Cyclist",
+    overlap: Annotated[str, typer.Option(help="3d, bev, or 2d as KITTI's benchmark")] = "3d",
+    iou: IouOption = None,
+    json: Json = None,
+) -> None:
+    """Score tracks in KITTI's format: HOTA, MOTA, AMOTA, identity switches.
+
+    Examples:
+      beambox score tracking --labels label_02/0012.txt --results tracks.txt --calib calib/0012.txt
+      beambox score tracking --labels label_02 --results out --calib calib --classes Car --overlap 2d
+    """
+    from beambox.track.scoring import read_drives, score_tracks
+
+    result = score_tracks(
+        read_drives(labels, results, calib),
+        parse_classes(classes),
+        overlap=overlap,  # pyright: ignore[reportArgumentType]  # score_tracks checks it
+        min_overlap=parse_overlaps(",".join(iou)) if iou else None,
+    )
+    print(result.table(), end="")
+    if json is not None:
+        from beambox.io import write_json
+
+        write_json(json, result.to_json())
+
+
+for function in (kitti, once, tracking):
     app.command(help=help_of(function))(guard(function))

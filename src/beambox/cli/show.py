@@ -58,6 +58,11 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     Labels and camera image are found beside a sweep in KITTI's layout (../label_2, ../image_2). A page (.html) shows
     points and boxes in three dimensions in any browser, and needs no other file.
     """
+    from beambox.data.existence import expect_inputs
+
+    check_choices(colour, model, results)
+    expect_inputs(inputs)
+
     from beambox.geometry.axes import Axes
     from beambox.infer.inputs import find_sweeps, read_sweep
     from beambox.infer.predictor import load
@@ -66,7 +71,6 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     from beambox.visualise.viewer import viewer_html
 
     show_log()
-    check_choices(colour, model, results)
     turned = Axes.parse(axes) if axes else Axes()
     shown = region_of_option(area)
     sweeps = find_sweeps(inputs)
@@ -90,7 +94,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         truth = truth_of(frame, labels)
         detections = found_in(frame, detector, results)
         if detections is not None:
-            detections = detections[detections.scores >= min_score]
+            detections = detections.above(min_score)
         frame = frame if detector is None else detector.crop(frame)
         frame, detections, truth = forward_up(frame, detections, truth, turned)
         if path.suffix == ".html":

@@ -41,34 +41,34 @@ def command(
     ] = None,
 ) -> None:
     """Simulate labelled LiDAR sweeps. An interrupted or shorter data set is continued by the same command."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from beambox import __version__
     from beambox.checks import BeamboxError
-    from beambox.data.kitti import KittiSource
-    from beambox.simulate import write_dataset
-    from beambox.simulate.compare import compare_objects
+    from beambox.cli.console import announce, say
+    from beambox.verbs import open_dataset, simulate
 
     if compare and files != "kitti":
         raise BeamboxError(f"--compare reads KITTI's layout, and --format is {files}; leave one of the two out")
-    real = KittiSource(compare, "train", fov=True) if compare else None  # before an hour of simulation
-
-    console = Console(stderr=True)
+    real = open_dataset(compare, "train", camera_view=True) if compare else None  # refused before an hour of work
     told = ", ".join(f"{name} {value}" for name, value in (("sensor", sensor), ("view", view)) if value)
-    console.print(
-        f"beambox {__version__}: {frames} frames in the layout of {files.upper()}, {told + ', ' if told else ''}"
-        f"layout {layout}, seed {seed}"
+    announce(
+        "simulate",
+        seed=seed,
+        detail=f"{frames} frames in the layout of {files.upper()}, {told + ', ' if told else ''}layout {layout}",
     )
-    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("simulating", total=frames)
-        split = None if layout_split == "all" else layout_split
-        write_dataset(
-            out, frames, sensor or None, view or None, layout, seed, workers, val_share, split,
-            lambda done, total: bar.update(task, completed=done, total=total),
-            files=files, sequence_length=sequence_length,
-        )  # fmt: skip
-    console.print(f"wrote {frames} frames to {out}")
-    if real:
-        print(compare_objects(real, KittiSource(out, "train", fov=True)).table(), end="")
+    simulate(
+        out,
+        frames,
+        format=files,
+        sensor=sensor or None,
+        view=view or None,
+        layout=layout,
+        layout_split=None if layout_split == "all" else layout_split,
+        seed=seed,
+        workers=workers,
+        val_share=val_share,
+        sequence_length=sequence_length,
+    )
+    say(f"wrote {frames} frames to {out}")
+    if real is not None:
+        from beambox.simulate.compare import compare_objects
+
+        print(compare_objects(real, open_dataset(out, "train", camera_view=True)).table(), end="")

@@ -14,7 +14,9 @@ def command(
     recipe: Annotated[
         str, typer.Argument(help="Name of a shipped recipe (`beambox recipes` lists them), or a YAML file.")
     ],
-    data: Annotated[Path | None, typer.Option(help="Folder that {data} stands for in the recipe.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="What {data} of the recipe stands for: a folder, or a YAML file.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME where not given.")] = None,
     change: Annotated[
         list[str] | None,
@@ -30,13 +32,7 @@ def command(
 
     On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox train RECIPE --data DIR
     """
-    from beambox.train.stages import read_stages, train_stages
+    from beambox.verbs import train
 
-    stages = read_stages(recipe, change or [])
-    if data is not None and not data.is_dir():
-        from beambox.checks import MissingFileError
-
-        raise MissingFileError(f"--data: there is no folder {data}")
-    outcome = train_stages(stages, data, out or Path("runs") / stages[-1].name, resume)
-    if not outcome.finished:
+    if not train(recipe, data, out, overrides=change or [], resume=resume).finished:
         raise typer.Exit(130)

@@ -29,7 +29,10 @@ import torch
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.kitti_text import parse_labels
+from beambox.data import kitti_text
+from beambox.data.labels.catalogue import FORMATS, parse_labels
+from beambox.data.labels.tables import DEGREES
+from beambox.data.labels.tables import SYNONYMS as ALIASES
 from beambox.geometry.calibration import Calibration
 from beambox.io import parse_json, word_to_name
 
@@ -43,16 +46,6 @@ __all__ = [
 ]
 
 NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw")
-ALIASES = {
-    "name": ("name", "label", "class", "type", "category", "class_name", "object_type", "obj_type"),
-    "frame": ("frame", "frame_id", "scan", "sweep", "frame_name"),
-    **{axis: (axis, f"c{axis}", f"center_{axis}", f"centre_{axis}", f"{axis}_center", f"pos_{axis}") for axis in "xyz"},
-    "l": ("l", "length", "dx", "size_x"),
-    "w": ("w", "width", "dy", "size_y"),
-    "h": ("h", "height", "dz", "size_z"),
-    "yaw": ("yaw", "heading", "theta", "rotation", "rotation_z", "rot_z", "rz", "yaw_rad", "heading_rad"),
-}
-DEGREES = ("yaw_deg", "yaw_degrees", "heading_deg", "heading_degrees", "rotation_deg", "yaw(deg)", "yaw (deg)")
 LONGEST_CELL = 10_000
 CAMERA_AT_THE_SENSOR = Calibration(
     p2=torch.tensor([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
@@ -79,12 +72,15 @@ def parse_box_file(text: str, kind: str, where: str) -> NamedBoxes:
 
     Args:
         text: content of the file.
-        kind: pandaset, csv or json.
+        kind: pandaset, csv or json, or a name of :data:`beambox.data.labels.catalogue.FORMATS`.
         where: what errors call the file.
 
     Raises:
         BeamboxError: naming file and line or entry.
     """
+    if kind in FORMATS:
+        found = _tool_boxes(text, kind, where)
+        return next(iter(found.values())) if found else _collect(())
     rows = {"pandaset": _pandaset_rows, "csv": _csv_rows, "json": _json_rows}[kind](text, where)
     return _collect([row[1:] for row in rows])
 
@@ -95,6 +91,8 @@ def parse_frames_file(text: str, kind: str, where: str) -> dict[str, NamedBoxes]
     Raises:
         BeamboxError: naming file and line or entry.
     """
+    if kind in FORMATS and FORMATS[kind].write_all is not None:
+        return _tool_boxes(text, kind, where)
     if kind not in ("csv", "json", "once"):
         raise BeamboxError(f"{where}: boxes in {kind} format come as one file a frame; put {{frame}} into its path")
     rows = {"csv": _csv_rows, "json": _json_rows, "once": _once_rows}[kind](text, where)
@@ -110,8 +108,14 @@ def parse_frames_file(text: str, kind: str, where: str) -> dict[str, NamedBoxes]
 
 def parse_kitti_boxes(text: str, calibration: Calibration, where: str) -> NamedBoxes:
     """Read a KITTI label file's boxes, carried into the LiDAR frame; DontCare regions are left out."""
-    labels = parse_labels(text, calibration, where)
+    labels = kitti_text.parse_labels(text, calibration, where)
     return NamedBoxes(labels.names, labels.boxes.double().numpy(), (where,) * len(labels))
+
+
+def _tool_boxes(text: str, kind: str, where: str) -> dict[str, NamedBoxes]:
+    """Read labels of an annotation tool."""
+    frames, _ = parse_labels(text, kind, where)
+    return {name: NamedBoxes(frame.names, frame.boxes, frame.places) for name, frame in frames.items()}
 
 
 Row = tuple[Any, str, Sequence[float], str]  # frame or None, name ("" for a frame without boxes), seven numbers, place
@@ -186,8 +190,8 @@ def _csv_rows(text: str, where: str) -> Iterable[Row]:
     for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
         if head.count(mark) > head.count(","):
             raise BeamboxError(
-                f"{where}, line 1: the columns are parted by {name}, expected commas (and points in numbers); save it "
-                "as comma-separated values, or give labels per frame as text (format: pandaset)"
+                f"{where}, line 1: the columns are parted by {name}, expected commas (and points in numbers); say "
+                "format: table, which takes them"
             )
     try:
         rows = [

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
+from beambox.data.labels.catalogue import FORMATS
 from beambox.geometry.axes import Axes, level_shift
 from beambox.io import read_yaml
 
@@ -19,6 +20,7 @@ __all__ = ["KITTI_GROUND", "CustomConfig", "GroundSlope", "read_custom_config"]
 KITTI_GROUND = -1.73
 """Height of the ground in frames whose sensor height is known, metres: KITTI's, which shipped weights expect."""
 EVERYTHING_ELSE = "*"
+LABEL_FORMATS = ("kitti", "once", "pandaset", "csv", "json", *FORMATS)
 
 
 class GroundSlope(BaseModel):
@@ -41,8 +43,9 @@ class CustomConfig(BaseModel):
     """Sweeps, as ``velodyne/{frame}.bin``; any format that ``beambox detect`` reads."""
     labels: str | None = None
     """Boxes, as ``boxes/{frame}.txt``, or one file for all frames, as ``boxes.csv``; none where nobody labelled."""
-    format: Literal["kitti", "once", "pandaset", "csv", "json"] | None = None
-    """How the boxes are written; found from the ending for .csv and .json."""
+    format: Literal[LABEL_FORMATS] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    """How the boxes are written: kitti, once, pandaset, csv, json, or as an annotation tool does (see
+    docs/label_formats.md); found from the ending for .csv and .json."""
     calibration: str | None = None
     """For boxes in KITTI's text format: calib files, as ``calib/{frame}.txt``, or one file for all. Without it the
     boxes are taken to stand in a camera frame (x right, y down, z forward) at the sensor."""
@@ -175,6 +178,6 @@ def read_custom_config(path: Path) -> CustomConfig:
         faults = []
         for fault in error.errors():
             place = ".".join(str(part) for part in fault["loc"])
-            text = fault["msg"].removeprefix("Value error, ")
+            text = fault["msg"].removeprefix("Value error, ")[:300]
             faults.append(f"{place}: {text}" if place else text)
-        raise BeamboxError(f"{path}: " + "; ".join(faults)) from None
+        raise BeamboxError(f"{path}: " + "; ".join(faults[:5])) from None

@@ -10,6 +10,7 @@ import numpy as np
 
 from beambox.checks import BeamboxError, did_you_mean, expect_same_length
 from beambox.data.footprints import overlap_bev
+from beambox.data.formats.arrays import load_archive
 from beambox.data.formats.columns import decode
 from beambox.data.source import FrameSource
 from beambox.data.walk import walk
@@ -19,6 +20,9 @@ from beambox.ops.points_in_boxes import points_in_boxes_mask
 __all__ = ["ObjectDatabase"]
 
 FORMAT = "beambox objects 1"
+ARRAYS = (("boxes", "f", 2), ("points", "f", 2), ("offsets", "iu", 1), ("labels", "iu", 1), ("classes", "U", 1),
+          ("frames", "U", 1))  # fmt: skip
+"""Name, kinds of numbers and dimensions of what a file holds."""
 OBJECTS = 2  # stream of random numbers; those of the loader are 0 and 1
 
 
@@ -134,14 +138,24 @@ class ObjectDatabase:
         path = Path(path)
 
         def read() -> ObjectDatabase:
-            with np.load(path, allow_pickle=False) as file:
-                if "format" not in file.files or str(file["format"]) != FORMAT:
-                    raise BeamboxError(f"{path} is not an object database of this version; build it again")
-                return cls(
-                    *(file[name] for name in ("boxes", "points", "offsets", "labels")),
-                    classes=tuple(file["classes"].tolist()),
-                    frames=tuple(file["frames"].tolist()),
-                )
+            file = load_archive(path, "object database")
+            if "format" not in file or str(file["format"]) != FORMAT:
+                raise BeamboxError(f"{path} is not an object database of this version; build it again")
+            for name, kinds, dimensions in ARRAYS:
+                array = file.get(name)
+                if array is None or array.dtype.kind not in kinds or array.ndim != dimensions:
+                    got = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
+                    raise ValueError(f"expected {dimensions}-dimensional `{name}`, got {got}")
+            boxes, points, offsets, labels, classes, frames = (file[name] for name, _, _ in ARRAYS)
+            _check_arrays(boxes, points, offsets, labels, len(classes))
+            return cls(
+                boxes.astype(np.float32),
+                points.astype(np.float32),
+                offsets.astype(np.int64),
+                labels.astype(np.int64),
+                classes=tuple(map(str, classes.tolist())),
+                frames=tuple(map(str, frames.tolist())),
+            )
 
         return decode(path, "object database", read)
 
@@ -230,3 +244,20 @@ class ObjectDatabase:
         points = self.points[rows]  # a copy: advanced indexing
         points[:, :3] += np.repeat(centres.astype(np.float32), lengths, axis=0)
         return points
+
+
+def _check_arrays(boxes: np.ndarray, points: np.ndarray, offsets: np.ndarray, labels: np.ndarray, classes: int) -> None:
+    """Refuse arrays that do not fit each other; an object's rows would else be those of another, or of none.
+
+    Raises:
+        ValueError: naming what does not fit.
+    """
+    if boxes.shape[1] != 7 or points.shape[1] < 4:
+        raise ValueError(f"expected boxes (K, 7) and points (P, 4 or more), got {boxes.shape} and {points.shape}")
+    if not np.isfinite(boxes).all() or not np.isfinite(points).all() or (len(boxes) and boxes[:, 3:6].min() < 0):
+        raise ValueError("expected finite numbers and sizes of at least 0")
+    counted = offsets.astype(np.int64)
+    if len(counted) != len(boxes) + 1 or counted[0] != 0 or counted[-1] != len(points) or (np.diff(counted) < 0).any():
+        raise ValueError("`offsets` must lead from 0 to the number of points")
+    if len(labels) != len(boxes) or (len(labels) and not 0 <= int(labels.min()) <= int(labels.max()) < classes):
+        raise ValueError(f"`labels` must be one for each box, in 0 to {classes - 1}")

@@ -12,17 +12,20 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.kitti_calibration import finite_numbers
+from beambox.data.kitti_calibration import finite_numbers, format_calibration, parse_calibration, read_calibration
 from beambox.geometry import Calibration
 from beambox.io import name_to_word, read_text, word_to_name
 from beambox.structures import Detections, ImageAttributes, Labels
 
 __all__ = [
     "DONT_CARE",
+    "format_calibration",
     "format_labels",
+    "parse_calibration",
     "parse_labels",
     "parse_plane",
     "parse_results",
+    "read_calibration",
     "read_labels",
     "read_results",
 ]

@@ -8,6 +8,7 @@ from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.custom import CustomSource
 from beambox.data.folder import FolderSource
 from beambox.data.kitti import KittiSource
+from beambox.data.nuscenes import NuScenesSource, nuscenes_tables
 from beambox.data.once import OnceSource
 from beambox.data.source import FrameSource
 
@@ -15,7 +16,7 @@ __all__ = ["open_data"]
 
 
 def open_data(path: Path | str, split: str = "val", *, fov: bool = False) -> FrameSource:
-    """Open a data set: a YAML file that describes one, a folder in KITTI's or ONCE's layout, or points/ and labels/.
+    """Open a data set: a YAML file that describes one, a folder of KITTI, ONCE or nuScenes, or points/ and labels/.
 
     Args:
         path: the file or folder.
@@ -33,6 +34,8 @@ def open_data(path: Path | str, split: str = "val", *, fov: bool = False) -> Fra
         raise MissingFileError(f"{path} is not there; give a data set's folder, or the YAML file that describes it")
     if not path.is_dir():
         raise BeamboxError(f"{path} is no data set; give a folder in KITTI's or ONCE's layout, or a YAML file")
+    if nuscenes_tables(path) is not None:
+        return NuScenesSource(path, split)
     if (path / "data").is_dir() and not (path / "training").is_dir():
         return OnceSource(path, split)
     if (path / "points").is_dir():

@@ -50,6 +50,7 @@ from beambox.layers.anchors import AnchorClass, AnchorGrid
 from beambox.layers.bev import BN_EPS, BN_MOMENTUM, conv_bn_relu, deconv_bn_relu, join_levels
 from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss, select_boxes
 from beambox.layers.pillars import PillarFeatures
+from beambox.ops.dispatch import Backend, always, can_run_graph, choose
 from beambox.ops.scatter import scatter_bev
 from beambox.ops.voxelize import Voxels, voxelize
 from beambox.structures.batch import Batch
@@ -261,8 +262,11 @@ def pillar_stacks(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
         ``(M, N, C)`` features of each occupied pillar, slices from the lowest up, zero where a slice is empty; and
         ``(M, 4)`` int64 (sample, 0, y, x) of the pillars.
     """
-    if torch.compiler.is_exporting():
-        return one_stack_a_voxel(features, voxels)
+    return choose("pillar_stacks", STACK_BACKENDS, features)(features, voxels)
+
+
+def one_stack_a_pillar(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
+    """Do as :func:`pillar_stacks` says."""
     nx, ny, slices = voxels.grid.size
     sample, z, y, x = voxels.index.unbind(dim=1)
     distinct, pillar = ((sample * ny + y) * nx + x).unique(return_inverse=True)  # (M,), (V,)
@@ -289,6 +293,12 @@ def one_stack_a_voxel(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]
     place = (pillar * slices + z)[:, None].expand_as(features)
     stacks = features.new_zeros(count * slices, channels).scatter(0, place, features).view(count, slices, channels)
     return stacks, torch.stack((sample, torch.zeros_like(z), y, x), dim=1)
+
+
+STACK_BACKENDS = (
+    Backend("graph", can_run_graph, lambda: one_stack_a_voxel),
+    Backend("reference", always, lambda: one_stack_a_pillar),
+)
 
 
 def pseudo_images(features: Tensor, voxels: Voxels) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,11 @@ from beambox.checks import BeamboxError
 from beambox.geometry.constants import constant
 
 __all__ = ["VoxelGrid"]
+
+MOST_CELLS = 900_000_000
+"""Cells of a grid; indices of the sparse operations and a map's features would not fit beyond."""
+MOST_CELLS_OF_MAP = 40_000_000
+"""Cells seen from above: a region of 300 m in cells of 5 cm."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +36,21 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         for axis, low, high, step in zip("xyz", self.minimum, self.maximum, self.cell):
+            if not all(map(math.isfinite, (low, high, step))):
+                raise BeamboxError(f"a grid needs finite numbers, got {low} to {high} by {step} on {axis}")
             if not (high > low and step > 0):
                 raise BeamboxError(
                     f"a grid needs minimum < maximum and a positive cell on each axis, "
                     f"got {low} to {high} by {step} on {axis}"
                 )
+
+        cells = [max(1.0, (high - low) / step) for low, high, step in zip(self.minimum, self.maximum, self.cell)]
+        if cells[0] * cells[1] > MOST_CELLS_OF_MAP or math.prod(cells) > MOST_CELLS:
+            told = " x ".join(f"{count:.4g}" for count in cells)
+            raise BeamboxError(
+                f"a grid of {told} cells fits no memory (at most {MOST_CELLS_OF_MAP:.1g} in a map and {MOST_CELLS:.1g} "
+                "in all): take a smaller range or larger cells"
+            )
 
     @property
     def size(self) -> tuple[int, int, int]:

@@ -18,11 +18,13 @@ import torch
 from torch import nn
 
 from beambox import __version__
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, MissingFileError
+from beambox.detectors.catalogue import build
 from beambox.infer.predictor import Detector
+from beambox.io import read_yaml
 from beambox.structures import Batch
 
-__all__ = ["STAGES", "Report", "measure"]
+__all__ = ["STAGES", "Report", "measure", "untrained"]
 
 STAGES = ("load", "voxelise", "network", "post-process")
 """Read and prepare the points and bring them to the device; gather them into cells, up to the first layer; the layers;
@@ -85,6 +87,33 @@ class Report:
         lines = [f"mean of {self.setting['runs']} runs, ms   here   KASSD's (its GPU is not stated)"]
         lines += [f"{name:<22}{statistics.fmean(self.of(stages)):9.2f}{theirs:9.1f}" for name, stages, theirs in parts]
         return "\n".join(lines)
+
+
+def untrained(name: str | Path, *, device: str | None = None, precision: str = "auto") -> Detector:
+    """Build a detector without trained weights, to be timed: its parameters are random, its size is as configured.
+
+    Args:
+        name: of the catalogue, for its published configuration, or a recipe (a .yaml file), for that one's.
+        device: "cpu", "cuda", ...; None takes the GPU where there is one.
+        precision: "auto", "float32", "bfloat16" or "float16".
+
+    Raises:
+        BeamboxError: if there is no such detector, or the recipe cannot be read.
+    """
+    if str(name).endswith((".yaml", ".yml")):
+        path = Path(name)
+        if not path.is_file():
+            raise MissingFileError(f"there is no recipe {path}")
+        plain = read_yaml(path)
+        wanted = plain.get("detector") if isinstance(plain, dict) else None
+        if not isinstance(wanted, dict) or "name" not in wanted:
+            raise BeamboxError(f"{path} names no detector; expected a recipe with `detector: {{name: ...}}`")
+        name, options = str(wanted["name"]), wanted.get("options") or {}
+    else:
+        options = {}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return Detector(build(str(name), options), device=device, precision=precision)
 
 
 def summary(times: Sequence[float]) -> dict[str, float]:

@@ -10,7 +10,21 @@ from typing import Any
 
 from beambox.detectors.weights import read_weights
 
-__all__ = ["Card", "card_text", "read_card"]
+__all__ = ["Card", "CardScores", "card_text", "read_card"]
+
+
+@dataclass(frozen=True)
+class CardScores:
+    """What weights score on one data set."""
+
+    data: str
+    """Which frames, in words."""
+    command: str
+    """What repeats the numbers."""
+    note: str
+    """What is to be kept in mind."""
+    values: Mapping[str, str]
+    """Numbers by metric, as written by the protocol."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +44,70 @@ class Card:
     sha256: str
     """Checksum of the file."""
     said: Mapping[str, Any]
-    """The card as it was written: data, recipe, licence, scores."""
+    """The card as it was written: data, recipe, licence, scores; the properties below read it."""
+
+    def __str__(self) -> str:
+        """Return the whole card as text."""
+        return card_text(self)
+
+    @property
+    def summary(self) -> str:
+        """What the weights are, in one line."""
+        return self._text("summary")
+
+    @property
+    def licence(self) -> str:
+        """Under which licence the weights stand, and why; empty where the card does not say."""
+        return self._text("licence")
+
+    @property
+    def trained_on(self) -> str:
+        """Which data the weights saw."""
+        return self._text("trained on")
+
+    @property
+    def training(self) -> str:
+        """How long the training took, and on what."""
+        return self._text("training")
+
+    @property
+    def recipe(self) -> str:
+        """Which recipe makes the weights again."""
+        return self._text("recipe")
+
+    @property
+    def weak_at(self) -> str:
+        """What the weights are known to do badly."""
+        return self._text("weak at")
+
+    @property
+    def protocol(self) -> str:
+        """How the scores were computed: benchmark, metric, unit."""
+        scores = self.said.get("scores")
+        return str(scores.get("protocol", "")) if isinstance(scores, Mapping) else ""
+
+    @property
+    def scores(self) -> tuple[CardScores, ...]:
+        """What the weights score, one entry for each data set."""
+        scores = self.said.get("scores")
+        if not isinstance(scores, Mapping):
+            return ()
+        sets = [(str(name), entry) for name, entry in scores.items() if isinstance(entry, Mapping)]
+        return tuple(
+            CardScores(
+                data=name,
+                command=str(entry.get("command", "")),
+                note=str(entry.get("note", "")),
+                values={str(key): str(value) for key, value in entry.items() if key not in ("command", "note")},
+            )
+            for name, entry in sets
+        )
+
+    def _text(self, key: str) -> str:
+        value = self.said.get(key, "")
+        return (
+            value if isinstance(value, str) else ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+        )
 
     def line(self) -> str:
         """One line for a list."""

@@ -76,7 +76,10 @@ def examine(path: Path | str, trained: Trained, fields: str | Sequence[str] | No
     findings = [Finding("reading", "note", note) for note in frame.notes]
     if not len(frame):
         return Diagnosis((*findings, Finding("points", "bad", "the sweep has no points")))
-    findings += [_units(frame.points)]
+    units = _units(frame.points)
+    findings += [units]
+    if units.level == "bad":  # what follows would measure metres that are none
+        return Diagnosis(tuple(findings))
     axes_finding, axes = _axes(frame.points)
     turned = Corrections(axes).apply(frame).points
     plane = fit_road_plane(turned)
@@ -96,9 +99,12 @@ def _units(points: Tensor) -> Finding:
     text = f"{len(points):,} points, 95% within {far:.4g} of the origin"
     if far > 1000:
         return Finding("points", "bad", f"{text}: metres around the sensor are expected; these look like millimetres "
-                       "or map coordinates. Divide, or subtract the sensor's position, first")  # fmt: skip
+                       "(divide them by 1000 first) or map coordinates (subtract the sensor's position first); nothing "
+                       "else was looked at")  # fmt: skip
     if far < 3:
-        return Finding("points", "bad", f"{text}: metres are expected; multiply first")
+        return Finding(
+            "points", "bad", f"{text}: metres are expected; multiply first (by 1000 if these are kilometres)"
+        )
     nothing = int((distance < 1e-6).sum())
     if nothing:
         text += f"; {nothing:,} lie exactly at the origin (laser pulses without an echo): harmless"
@@ -194,7 +200,8 @@ def _range(given: Tensor, fixed: Tensor, trained: Trained) -> Finding:
     if then > inside + 0.05:
         text += f"; with the height put right {then:.0%}"
     if max(inside, then) < 0.02:
-        reach = max(20, 10 * round(float(given[:, :2].abs().quantile(0.9)) / 10)) if len(given) < 10**7 else 50
+        some = given[:: max(1, len(given) // 100_000), :2].abs()  # quantile takes no more than 16 million
+        reach = min(100, max(20, 10 * round(float(some.quantile(0.9)) / 10)))
         return Finding("range", "bad", text, ("--range", f"{reach}"))
     behind = float((given[:, 0] < low[0]).float().mean())
     if behind > 0.3:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -20,6 +20,10 @@ from beambox.metrics.kitti_result import KittiResult
 from beambox.metrics.once_result import OnceResult
 from beambox.metrics.rounds import merge_entries, parse_rounds, score_rounds
 from beambox.structures import Batch, Detections, Frame, Labels
+from beambox.structures.rows import frame_of_rows
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = [
     "Evaluation",
@@ -159,6 +163,19 @@ class Evaluation:
             if name in entries:
                 entries[name]["errors"] = errors
         return entries
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Return one flat record for each number scored, as the results of the rounds do."""
+        return [{**row, "precision": self.precision} for result in self.rounds for row in result.to_rows()]
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the records of :meth:`to_rows` as a table (needs pandas)."""
+        columns = list(self.rounds[0].to_pandas().columns) if self.rounds else []
+        return frame_of_rows(self.to_rows(), [*columns, "precision"])
+
+    def __str__(self) -> str:
+        """Return the numbers as text, as :meth:`table` does."""
+        return self.table()
 
     def table(self, name: str = "this result", published: bool = False) -> str:
         """Return the numbers as text.

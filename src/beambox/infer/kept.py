@@ -92,12 +92,14 @@ class KeptDetections:
         try:
             boxes = torch.tensor(entry["boxes"], dtype=torch.float32).reshape(-1, 7)
             scores = torch.tensor(entry["scores"], dtype=torch.float32)
-            labels = torch.tensor(entry["labels"], dtype=torch.int64)
+            class_ids = torch.tensor(entry["class_ids"], dtype=torch.int64)
             name = check_file_name(entry["frame"], str(self.path))
             finite = bool(torch.isfinite(boxes).all() and torch.isfinite(scores).all())
-            self.frames[name] = Detections(boxes, scores, labels, self.classes, name)
+            self.frames[name] = Detections(boxes, scores, class_ids, self.classes, name)
         except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise BeamboxError(f"{self.path}, line {number}: expected frame, boxes, scores, labels: {error}") from None
+            raise BeamboxError(
+                f"{self.path}, line {number}: expected frame, boxes, scores, class_ids: {error}"
+            ) from None
         if not finite:
             raise BeamboxError(f"{self.path}, line {number}: expected finite boxes and scores")
 
@@ -121,7 +123,7 @@ class KeptDetections:
                 yield frame, self.frames[frame.id]
 
     def _keep(self, frame: Frame, found: Detections) -> None:
-        values = {"boxes": found.boxes.float(), "scores": found.scores.float(), "labels": found.labels}
+        values = {"boxes": found.boxes.float(), "scores": found.scores.float(), "class_ids": found.class_ids}
         self._append({"frame": frame.id, **{key: value.tolist() for key, value in values.items()}})
         self.frames[frame.id] = found
 

@@ -46,6 +46,10 @@ ONCE_ANCHORS = (
 )
 
 
+_MADE: dict[tuple[AnchorGrid, VoxelGrid, torch.device], Tensor] = {}
+_MOST = 16
+
+
 @dataclass(frozen=True)
 class AnchorGrid:
     """Anchors of several classes over a map whose cells are ``stride`` voxels wide.
@@ -77,9 +81,22 @@ class AnchorGrid:
     def boxes(self, grid: VoxelGrid, device: torch.device | str = "cpu") -> Tensor:
         """Return all anchors over ``grid``, in the order (y, x, class, rotation).
 
+        They are made once a grid and device, and kept: nobody may write to them.
+
         Returns:
             ``(ny * nx * classes * 2, 7)`` float32.
         """
+        if torch.compiler.is_compiling() or torch.compiler.is_exporting():  # what is traced must not outlive the trace
+            return self._boxes(grid).to(device)
+        key = (self, grid, torch.device(device))
+        if key not in _MADE:
+            if len(_MADE) >= _MOST:
+                _MADE.pop(next(iter(_MADE)))  # training's windows follow one another, and come back
+            with torch.inference_mode(False):
+                _MADE[key] = self._boxes(grid).to(device)
+        return _MADE[key]
+
+    def _boxes(self, grid: VoxelGrid) -> Tensor:
         ny, nx = self.map_size(grid)
         xs, ys = self._positions(0, grid, nx), self._positions(1, grid, ny)
         shapes = torch.tensor(
@@ -90,7 +107,7 @@ class AnchorGrid:
         out[..., 0] = xs[None, :, None]
         out[..., 1] = ys[:, None, None]
         out[..., 2:] = shapes
-        return out.reshape(-1, 7).float().to(device)
+        return out.reshape(-1, 7).float()
 
     @property
     def per_cell(self) -> int:

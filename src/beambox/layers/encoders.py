@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from beambox.geometry.constants import constant
 from beambox.layers.sparse import levels_left, sparse_block, submanifold_block
 from beambox.ops.scatter import segment_mean
-from beambox.ops.sparse_conv import SparseTensor
+from beambox.ops.sparse_conv import Sites, SparseTensor, find_chain
 from beambox.ops.voxelize import Voxels
 
 __all__ = ["EncoderStages", "VoxelEncoder", "mean_voxels"]
@@ -28,11 +29,12 @@ def mean_voxels(voxels: Voxels, absolute_xy: bool = True) -> SparseTensor:
     """
     means = segment_mean(voxels.points, voxels.voxel, len(voxels.index))  # (V, C)
     if not absolute_xy:
-        cell = torch.tensor(voxels.grid.cell[:2], device=means.device)
+        cell = constant(voxels.grid.cell[:2], means.device)
         offset = (means[:, :2] - voxels.grid.centre(voxels.index[:, 1:])[:, :2]) / cell
         means = torch.cat((offset.to(means.dtype), means[:, 2:]), dim=1)
     nz, ny, nx = voxels.grid.shape
-    return SparseTensor.of(means, voxels.index, (nz + 1, ny, nx), voxels.batch_size).sorted()
+    sites = Sites.trusted(voxels.index, (nz + 1, ny, nx), voxels.batch_size)
+    return SparseTensor(means, sites).sorted()
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ class VoxelEncoder(nn.Module):
 
     def forward(self, voxels: SparseTensor) -> EncoderStages:
         """Encode ``(V, in_channels)`` voxel features."""
+        strided = (self.stage2[0], self.stage3[0], self.stage4[0], self.out)
+        find_chain(voxels.sites, [block.conv.geometry for block in strided])  # pyright: ignore
         with torch.autocast(voxels.features.device.type, enabled=False):  # metres: bfloat16 would round them to 0.5
             stem = self.stem(voxels)
         stride1 = self.stage1(stem)

@@ -15,7 +15,8 @@ from beambox.layers.anchors import AnchorGrid
 from beambox.layers.assigners import assign
 from beambox.layers.coders import decode_boxes, direction_bin, encode_boxes, resolve_heading
 from beambox.layers.losses import sigmoid_focal, sine_difference, smooth_l1
-from beambox.ops.nms import nms
+from beambox.ops.dispatch import waiting_is_dear
+from beambox.ops.nms import nms, nms_of_samples
 
 __all__ = [
     "AnchorHead",
@@ -24,7 +25,10 @@ __all__ = [
     "PostProcess",
     "anchor_loss",
     "best_anchors",
+    "best_of_samples",
+    "of_rows",
     "select_boxes",
+    "suppressed",
 ]
 
 
@@ -54,6 +58,12 @@ class AnchorPredictions:
         boxes = decode_boxes(self.box[sample, rows].float(), self.anchors[rows])
         yaw = resolve_heading(boxes[:, 6], self.direction[sample, rows].argmax(dim=-1))
         return torch.cat((boxes[:, :6], yaw[:, None]), dim=1)
+
+    def decoded_places(self, rows: Tensor) -> Tensor:
+        """Boxes of some anchors of each sample with resolved headings: ``(B, P)`` int64 -> ``(B, P, 7)`` float32."""
+        boxes = decode_boxes(of_rows(self.box, rows).float(), self.anchors[rows])
+        yaw = resolve_heading(boxes[..., 6], of_rows(self.direction, rows).argmax(dim=-1))
+        return torch.cat((boxes[..., :6], yaw[..., None]), dim=-1)
 
 
 @dataclass(frozen=True)
@@ -184,8 +194,13 @@ def select_boxes(predictions: AnchorPredictions, options: PostProcess) -> list[t
     """Keep the good boxes of each sample: threshold, the best ``nms_pre``, class-agnostic rotated suppression.
 
     Returns:
-        For each sample boxes ``(M, 7)``, scores ``(M,)`` and class positions ``(M,)``, best first.
+        For each sample boxes ``(M, 7)``, scores ``(M,)`` and class positions ``(M,)``, best first; of predictions on a
+        GPU they lie on the CPU, as reading them is all that was left to do.
     """
+    if waiting_is_dear(predictions.cls):
+        score, label = predictions.cls.float().max(dim=-1)  # (B, N)
+        score, rows, count = best_of_samples(torch.sigmoid(score), options.score_threshold, options.nms_pre)
+        return suppressed(predictions.decoded_places(rows), score, label.gather(1, rows), count, options)
     kept = []
     for sample in range(len(predictions.cls)):
         rows, score, label = best_anchors(predictions, sample, options.score_threshold, options.nms_pre)
@@ -193,3 +208,51 @@ def select_boxes(predictions: AnchorPredictions, options: PostProcess) -> list[t
         keep = nms(boxes, score, options.nms_iou, options.nms_pre, options.nms_post)
         kept.append((boxes[keep], score[keep], label[keep]))
     return kept
+
+
+def of_rows(values: Tensor, rows: Tensor) -> Tensor:
+    """Take some rows of each sample: ``(B, N, C)`` and ``(B, P)`` int64 -> ``(B, P, C)``."""
+    return values.gather(1, rows[..., None].expand(*rows.shape, values.shape[-1]))
+
+
+def best_of_samples(score: Tensor, threshold: float, limit: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Sort each sample's scores, of equals the first first, without asking how many reach the threshold.
+
+    Args:
+        score: ``(B, N)``; what is NaN never counts.
+        threshold: smallest score that counts.
+        limit: the most that count, of a sample.
+
+    Returns:
+        The P best scores ``(B, P)`` and their rows ``(B, P)`` int64, and how many of them count ``(B,)`` int64.
+    """
+    known = torch.where(score >= threshold, score, -torch.inf)
+    known, rows = known.sort(dim=1, descending=True, stable=True)
+    known, rows = known[:, :limit], rows[:, :limit]
+    return known, rows, (known > -torch.inf).sum(dim=1)
+
+
+def suppressed(
+    boxes: Tensor, score: Tensor, label: Tensor, count: Tensor, options: PostProcess
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Suppress the boxes of all samples on their device and bring what is left to the CPU, which waits once.
+
+    Args:
+        boxes: ``(B, P, 7)``, each sample's best first.
+        score: ``(B, P)``.
+        label: ``(B, P)`` int64.
+        count: ``(B,)`` int64 how many of the P there are.
+        options: overlap and number kept.
+
+    Returns:
+        As :func:`select_boxes`.
+    """
+    kept, number = nms_of_samples(boxes, count, options.nms_iou, options.nms_post)
+    rows = kept.clamp(min=0)  # (B, post)
+    columns = torch.cat(
+        (of_rows(boxes, rows), score.gather(1, rows)[..., None], label.gather(1, rows)[..., None]), dim=2
+    )
+    told = torch.cat((columns.flatten(), number.to(columns.dtype))).cpu()  # whole numbers this small are exact
+    table = told[: columns.numel()].view(columns.shape)
+    numbers = [int(n) for n in told[columns.numel() :].tolist()]
+    return [(one[:n, :7], one[:n, 7], one[:n, 8].long()) for one, n in zip(table, numbers)]

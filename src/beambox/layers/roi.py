@@ -12,9 +12,10 @@ from torch.nn import functional
 
 from beambox.geometry.boxes import corners_3d, local_to_world, rotate_z, wrap_angle
 from beambox.layers.coders import decode_boxes, encode_boxes
-from beambox.layers.heads import AnchorPredictions, PostProcess
+from beambox.layers.heads import AnchorPredictions, PostProcess, best_of_samples, of_rows, suppressed
 from beambox.layers.losses import smooth_l1
-from beambox.ops.nms import nms
+from beambox.ops.dispatch import waiting_is_dear
+from beambox.ops.nms import nms, nms_of_samples
 from beambox.ops.rotated_iou import iou_3d
 
 __all__ = [
@@ -48,7 +49,10 @@ class ProposalLimits:
 
 @dataclass(frozen=True)
 class Rois:
-    """Regions of interest of a batch, sample after sample; R in all, never padded."""
+    """Regions of interest of a batch, sample after sample; R in all.
+
+    On a GPU, where their number would have to be waited for, each sample has as many, and ``valid`` says which exist.
+    """
 
     boxes: Tensor
     """``(R, 7)``."""
@@ -58,6 +62,13 @@ class Rois:
     """``(R,)`` int64, ascending."""
     batch_size: int
     """Number of samples; some may have no region."""
+    valid: Tensor | None = None
+    """``(R,)`` bool; the regions of a sample that exist come first. None where all do."""
+
+    def of_sample(self, sample: int) -> Tensor:
+        """Return the rows of a sample's regions, ``(M,)`` int64."""
+        mine = self.sample == sample
+        return torch.nonzero(mine if self.valid is None else mine & self.valid)[:, 0]
 
 
 @dataclass(frozen=True)
@@ -99,6 +110,8 @@ class RoiTargets:
 def propose(predictions: AnchorPredictions, limits: ProposalLimits) -> Rois:
     """Take each sample's best decoded boxes through a class-agnostic suppression; no gradient."""
     with torch.no_grad():
+        if waiting_is_dear(predictions.cls):
+            return _propose_of_samples(predictions, limits)
         decoded = predictions.decoded()
         score, label = predictions.cls.float().max(dim=-1)  # (B, N); the sigmoid would not change the order
         kept = [nms(boxes, s, limits.iou, limits.pre, limits.post) for boxes, s in zip(decoded, score)]
@@ -109,6 +122,24 @@ def propose(predictions: AnchorPredictions, limits: ProposalLimits) -> Rois:
             torch.repeat_interleave(torch.arange(len(kept), device=score.device), counts),
             len(kept),
         )
+
+
+def _propose_of_samples(predictions: AnchorPredictions, limits: ProposalLimits) -> Rois:
+    """Propose as many regions for each sample, without asking how many exist."""
+    score, label = predictions.cls.float().max(dim=-1)  # (B, N)
+    score, rows, count = best_of_samples(score, -math.inf, limits.pre)
+    boxes = predictions.decoded_places(rows)  # (B, P, 7)
+    kept, number = nms_of_samples(boxes, count, limits.iou, limits.post)
+    places = kept.clamp(min=0)  # (B, post)
+    samples, post = places.shape
+    place = torch.arange(samples * post, device=score.device)
+    return Rois(
+        of_rows(boxes, places).flatten(0, 1),
+        label.gather(1, rows.gather(1, places)).flatten(),
+        place // max(1, post),
+        samples,
+        (torch.arange(post, device=score.device) < number[:, None]).flatten(),
+    )
 
 
 def sample_rois(
@@ -130,7 +161,7 @@ def sample_rois(
     chosen, matched, overlaps = [], [], []
     with torch.no_grad():
         for sample in range(rois.batch_size):
-            rows = torch.nonzero(rois.sample == sample)[:, 0]
+            rows = rois.of_sample(sample)
             if len(rows) == 0:
                 continue
             iou, best = best_overlap(rois.boxes[rows], rois.labels[rows], boxes[sample], classes[sample])
@@ -276,8 +307,15 @@ def select_rois(rois: Rois, cls: Tensor, boxes: Tensor, options: PostProcess) ->
     """
     kept = []
     score = torch.sigmoid(cls.float())
+    if rois.valid is not None and len(boxes):
+        score = torch.where(rois.valid, score, torch.nan).view(rois.batch_size, -1)  # (B, R / B)
+        score, rows, count = best_of_samples(score, options.score_threshold, options.nms_pre)
+        of_sample = boxes.view(rois.batch_size, -1, 7)
+        label = rois.labels.view(rois.batch_size, -1).gather(1, rows)
+        return suppressed(of_rows(of_sample, rows), score, label, count, options)
     for sample in range(rois.batch_size):
-        row = torch.nonzero((rois.sample == sample) & (score >= options.score_threshold))[:, 0]
+        row = rois.of_sample(sample)
+        row = row[score[row] >= options.score_threshold]
         row = row[nms(boxes[row], score[row], options.nms_iou, options.nms_pre, options.nms_post)]
         kept.append((boxes[row], score[row], rois.labels[row]))
     return kept

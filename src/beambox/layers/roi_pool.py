@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from beambox.geometry.boxes import local_to_world
+from beambox.geometry.constants import constant
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.roi import Rois
 from beambox.ops.sparse_conv import SparseTensor
@@ -55,20 +57,24 @@ class _Gather(nn.Module):
     def forward(self, points: Tensor, cells: Tensor, cell_features: SparseTensor, grid: VoxelGrid) -> Tensor:
         """Describe ``(M, 3)`` points in cells ``(M, 4)`` of full resolution: ``(M, channels)``."""
         level, sites = self.level, cell_features.sites
-        size = torch.tensor(grid.cell, device=points.device) * level.stride
-        minimum = torch.tensor(grid.minimum, device=points.device)
+        size = constant(grid.cell, points.device) * level.stride
+        minimum = constant(grid.minimum, points.device)
         centres = (sites.indices[:, 1:].flip(1) + 0.5) * size + minimum  # (V, 3)
         own = torch.cat((cells[:, :1], torch.div(cells[:, 1:], level.stride, rounding_mode="floor")), dim=1)
         found = voxel_query(points, own, sites, centres, level.reach, level.radius, level.samples)  # (M, S)
         none = found[:, :1] < 0
-        features = _normed(self.feature(cell_features.features.to(points.dtype)), self.feature_norm)  # (V, C)
+        features = _normed(
+            self.feature(cell_features.features.to(self.feature.weight.dtype)), self.feature_norm
+        )  # (V, C)
         row = found.clamp(min=0)
         if len(features) == 0:
             # the sum of no rows is zero and keeps every parameter in the graph, as processes in step need
             features, centres = features.sum(dim=0, keepdim=True), centres.new_zeros((1, 3))
         gathered = torch.where(none[..., None], 0.0, features[row])  # (M, S, C)
         away = torch.where(none[..., None], 0.0, centres[row] - points[:, None])  # (M, S, 3)
-        position = _normed(self.offset(away).flatten(0, 1), self.offset_norm).unflatten(0, found.shape)
+        position = _normed(self.offset(away.to(self.offset.weight.dtype)).flatten(0, 1), self.offset_norm).unflatten(
+            0, found.shape
+        )
         pooled = functional.relu((gathered + position).amax(dim=1))  # (M, C); ReLU and maximum commute
         return functional.relu(_normed(self.out(pooled), self.out_norm))
 
@@ -96,15 +102,14 @@ class VoxelRoiPool(nn.Module):
 
     def grid_points(self, boxes: Tensor) -> Tensor:
         """Return ``lattice ** 3`` points in each box, evenly spread, z fastest: ``(R, 7)`` -> ``(R, G, 3)``."""
-        steps = (torch.arange(self.lattice, device=boxes.device) + 0.5) / self.lattice - 0.5
-        local = torch.cartesian_prod(steps, steps, steps)  # (G, 3)
+        steps = [(i + 0.5) / self.lattice - 0.5 for i in range(self.lattice)]
+        local = constant(tuple(product(steps, steps, steps)), boxes.device, torch.float32)  # (G, 3)
         return local_to_world(local * boxes[:, None, 3:6], boxes)
 
     def forward(self, rois: Rois, levels: Sequence[SparseTensor], grid: VoxelGrid) -> Tensor:
         """Pool the levels at the regions: ``(R, out_channels)``, grid point after grid point."""
         points = self.grid_points(rois.boxes.detach()).flatten(0, 1)  # (R * G, 3)
-        minimum = torch.tensor(grid.minimum, device=points.device)
-        size = torch.tensor(grid.cell, device=points.device)
+        minimum, size = constant(grid.minimum, points.device), constant(grid.cell, points.device)
         cell = torch.div(points - minimum, size, rounding_mode="floor").long().flip(1)  # (R * G, 3) z, y, x
         sample = rois.sample.repeat_interleave(self.lattice**3)
         cells = torch.cat((sample[:, None], cell), dim=1)
@@ -145,7 +150,8 @@ class RoiHead(nn.Module):
         shared = self.shared(pooled)  # (R, width)
         cls, box = self.cls_layers(shared), self.box_layers(shared)
         with torch.autocast(pooled.device.type, enabled=False):  # boxes to the millimetre: bfloat16 has three digits
-            return RoiPredictions(self.cls(cls.float())[:, 0], self.box(box.float()))
+            kind = self.cls.weight.dtype
+            return RoiPredictions(self.cls(cls.to(kind))[:, 0], self.box(box.to(kind)))
 
 
 def _connected(in_channels: int, width: int, dropout: float) -> nn.Sequential:

@@ -80,6 +80,10 @@ class BoxErrors:
         """Return the numbers of each class."""
         return {one.name: one.to_json() for one in self.classes}
 
+    def __str__(self) -> str:
+        """Return the numbers as text, as :meth:`table` does."""
+        return self.table()
+
     def table(self) -> str:
         """Return the numbers as text: centimetres and degrees, mean and spread."""
         lines = [

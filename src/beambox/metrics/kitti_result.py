@@ -5,6 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from beambox.structures.rows import frame_of_rows
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = ["AveragePrecision", "ClassResult", "KittiResult"]
 
@@ -86,6 +92,26 @@ class KittiResult:
             }
             for result in self.classes
         }
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Return one flat record per class, metric and level: AP in percent, NaN where nothing could be scored."""
+        return [
+            {
+                "class": result.name, "iou": result.iou, "metric": name, "level": level, "objects": count,
+                "R40": one.r40, "R11": one.r11, "all": one.all_points,
+            }
+            for result in self.classes
+            for name, averages in result.metrics()
+            for level, count, one in zip(self.levels, result.objects, averages)
+        ]  # fmt: skip
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the records of :meth:`to_rows` as a table (needs pandas)."""
+        return frame_of_rows(self.to_rows(), ("class", "iou", "metric", "level", "objects", "R40", "R11", "all"))
+
+    def __str__(self) -> str:
+        """Return the numbers as text, as :meth:`table` does."""
+        return self.table()
 
     def table(self) -> str:
         """Return the numbers as text, with the protocol above them."""

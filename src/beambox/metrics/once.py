@@ -13,7 +13,6 @@ The algorithm is that of the official devkit (ONCE_Benchmark, CPU evaluation), i
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.geometry.boxes import wrap_angle
+from beambox.io import read_json
 from beambox.metrics.matching import MatchTable, count, sampled_precision, true_positive_scores
 from beambox.metrics.once_result import OnceResult
 from beambox.metrics.overlap import rotated_overlaps, starts
@@ -306,10 +306,7 @@ def _thresholds(classes: Mapping[str, float], given: Mapping[str, float]) -> dic
 def _read(path: Path) -> Any:
     if not path.is_file():
         raise MissingFileError(f"{path} does not exist; it holds ONCE annotations as JSON")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise BeamboxError(f"{path} is not valid JSON: {error}") from error
+    return read_json(path)
 
 
 def _entries(content: Any, key: str, path: Path) -> list[dict[str, Any]]:
@@ -324,20 +321,31 @@ def _entries(content: Any, key: str, path: Path) -> list[dict[str, Any]]:
 
 
 def _frame_id(entry: Mapping[str, Any]) -> str:
-    return str(entry["frame_id"])
+    return str(entry["frame_id"])[:100]
 
 
 def _boxes(entry: Mapping[str, Any], where: str, scored: bool) -> OnceBoxes:
     entry = entry.get("annos", entry)
+    if not isinstance(entry, dict):
+        raise BeamboxError(f"{where}: expected names and boxes_3d, got {type(entry).__name__}")
     for key in ("names", "boxes_3d", *(("scores",) if scored else ())):
         if key not in entry and not (key == "scores" and "score" in entry) and not (key == "names" and "name" in entry):
             raise BeamboxError(f"{where}: the key {key!r} is missing{did_you_mean(key, entry)}")
-    names = tuple(map(str, entry.get("names", entry.get("name"))))
+    names = entry.get("names", entry.get("name"))
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BeamboxError(f"{where}: names must be a list of texts, got {str(names)[:60]}")
+    names = tuple(names)
     try:
-        boxes = np.array(entry["boxes_3d"], dtype=np.float64).reshape(-1, 7)
+        boxes = np.array(entry["boxes_3d"], dtype=np.float64)
+        boxes = boxes.reshape(0, 7) if boxes.size == 0 else boxes
+        if boxes.ndim != 2 or boxes.shape[1] != 7:
+            raise ValueError(f"got an array of shape {boxes.shape}")
         scores = np.array(entry.get("scores", entry.get("score")) if scored else [0.0] * len(names), dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BeamboxError(f"{where}: boxes_3d must be rows of x y z l w h yaw and scores numbers, {error}") from error
+        if scores.ndim != 1:
+            raise ValueError(f"got scores of shape {scores.shape}")
+    except (TypeError, ValueError, OverflowError) as error:
+        told = str(error)[:120]
+        raise BeamboxError(f"{where}: boxes_3d must be rows of x y z l w h yaw and scores numbers, {told}") from None
     if not len(names) == len(boxes) == len(scores):
         told = f"{len(names)} names, {len(boxes)} boxes_3d" + (f", {len(scores)} scores" if scored else "")
         raise BeamboxError(f"{where}: lists must have one length, got {told}")

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from beambox.structures.rows import frame_of_rows
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = ["BANDS", "PUBLISHED", "OnceResult", "PublishedRow"]
 
@@ -42,6 +47,22 @@ class OnceResult:
 
         entries = {name: {"iou": iou, **bands(row)} for name, iou, row in zip(self.classes, self.iou, self.ap)}
         return {**entries, "mean": bands(self.mean())} if self.whole else entries
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Return one flat record per class and band of distance: AP in percent."""
+        return [
+            {"class": name, "iou": iou, "band": band, "objects": count, "AP": value}
+            for name, iou, counts, row in zip(self.classes, self.iou, self.objects, self.ap)
+            for band, count, value in zip(BANDS, counts, row)
+        ]
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the records of :meth:`to_rows` as a table (needs pandas)."""
+        return frame_of_rows(self.to_rows(), ("class", "iou", "band", "objects", "AP"))
+
+    def __str__(self) -> str:
+        """Return the numbers as text, as :meth:`table` does."""
+        return self.table()
 
     def table(self, name: str = "this result", published: bool = False) -> str:
         """Return the numbers as text, in the layout of DenNet's Table 3.

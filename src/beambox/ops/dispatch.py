@@ -1,7 +1,8 @@
 """Which version of an operation runs: a flat list, best first, each backend saying why it cannot run.
 
 The environment variable ``BEAMBOX_BACKEND`` pins one of ``reference``, ``numba`` and ``triton``. A pinned backend that
-cannot run raises with its reason; an operation that has no version of the pinned kind runs its reference.
+cannot run raises with its reason; an operation that has no version of the pinned kind runs its reference. A version
+called ``graph`` runs while a network is exported, whatever is pinned: it needs sizes alone and no values.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ __all__ = [
     "BACKEND_NAMES",
     "Backend",
     "always",
+    "can_run_graph",
     "can_run_numba",
     "can_run_triton",
     "choose",
+    "exporting",
     "needs_gradient",
     "pinned",
+    "waiting_is_dear",
 ]
 
 BACKEND_NAMES = ("reference", "numba", "triton")
@@ -40,7 +44,7 @@ class Backend:
     """One version of an operation."""
 
     name: str
-    """One of ``BACKEND_NAMES``."""
+    """One of ``BACKEND_NAMES``, or ``graph``, which is never pinned."""
     can_run: Callable[..., str | None]
     """Given the operation's tensors, the reason why this backend cannot run on them, or None."""
     load: Callable[[], Callable[..., Any]]
@@ -49,6 +53,16 @@ class Backend:
 
 def always(*tensors: Tensor) -> None:
     """Return None: the plain PyTorch reference runs anywhere."""
+
+
+def exporting() -> bool:
+    """Tell whether ``torch.export`` traces a graph: sizes are known then, values are not, so none can be checked."""
+    return torch.compiler.is_exporting()
+
+
+def can_run_graph(*tensors: Tensor) -> str | None:
+    """Return why the version made for exported graphs does not run, or None."""
+    return None if exporting() else "no graph is being exported"
 
 
 def can_run_numba(*tensors: Tensor) -> str | None:
@@ -92,6 +106,14 @@ def pinned() -> str | None:
     return name or None
 
 
+def waiting_is_dear(tensor: Tensor) -> bool:
+    """Tell whether the host should not ask what a tensor holds: it would wait for all that a GPU was given before.
+
+    There sizes are kept fixed, and read once at the end. On the CPU exact sizes are faster.
+    """
+    return pinned() in (None, "triton") and can_run_triton(tensor) is None
+
+
 def choose(operation: str, backends: Sequence[Backend], *tensors: Tensor) -> Callable[..., Any]:
     """Return the first backend of the list that can run, or the pinned one.
 
@@ -103,7 +125,7 @@ def choose(operation: str, backends: Sequence[Backend], *tensors: Tensor) -> Cal
     Raises:
         BeamboxError: if a backend is pinned and cannot run on these tensors.
     """
-    pin = pinned()
+    pin = None if exporting() else pinned()
     if pin is not None:
         backend = next((b for b in backends if b.name == pin), backends[-1])
         reason = backend.can_run(*tensors)

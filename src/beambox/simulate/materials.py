@@ -28,7 +28,7 @@ class Palette:
             (rng.uniform(0.28, 0.45), 0.03, 0.10, 1.6, 0.45, 0.0, 0.0),
             (rng.uniform(0.45, 0.75), 0.05, 0.10, 3.0, 0.50, 0.0, 0.0),
             (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0),  # AIR
-            (0.02, 2.0, 0.03, 0.3, 2.5, rng.uniform(0.80, 0.93), 0.3),  # GLASS of cars: a mirror unless met squarely
+            (0.02, 2.0, 0.03, 0.3, 2.5, rng.uniform(0.90, 0.98), 0.3),  # GLASS of cars: a mirror unless met squarely
             (0.03, 2.0, 0.10, 0.12, 2.0, 0.0, 0.5),  # PANE: a house's or tram's window, mostly lost
             (0.03, 0.5, 0.04, 0.7, 0.5, 0.0, 0.0),  # DARK: seats, underbody
             (0.06, 0.5, 0.05, 0.6, 0.5, 0.0, 0.0),  # TYRE

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.io import read_yaml
 
 __all__ = ["SENSORS", "Sensor", "load_sensor"]
+
+MOST_RAYS = 4_000_000
+"""Firings of a full turn; the densest sensors have 0.6 million."""
+LIMITS = (("azimuth_step", 1e-3, 120), ("height", 0, 100), ("max_range", 0, 2000), ("min_range", 0, 2000),
+          ("range_noise", 0, 10), ("intensity_step", 0, 1), ("sensitivity", 0, 1e6))  # fmt: skip
+"""Field, least and greatest value."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,22 @@ class Sensor:
             value = {f.name: value for f, value in zip(fields(self), self._values())}[name]
             if not value > 0:
                 raise BeamboxError(f"`{name}` must be greater than 0, got {value}")
+        numbers = {f.name: value for f, value in zip(fields(self), self._values()) if f.name != "name"}
+        for name, value in numbers.items():
+            if not all(map(math.isfinite, value if isinstance(value, tuple) else (value,))):
+                raise BeamboxError(
+                    f"`{name}` must be finite, got {value if not isinstance(value, tuple) else 'inf or nan'}"
+                )
+        for name, least, most in LIMITS:
+            if not least <= numbers[name] <= most:
+                raise BeamboxError(f"`{name}` must lie between {least:g} and {most:g}, got {numbers[name]:g}")
+        if len(self.elevations) * self.columns > MOST_RAYS:
+            raise BeamboxError(
+                f"a turn of {len(self.elevations)} beams every {self.azimuth_step:g} degrees fires "
+                f"{len(self.elevations) * self.columns:,} times, expected at most {MOST_RAYS:,}"
+            )
+        if self.min_range >= self.max_range:
+            raise BeamboxError(f"`min_range` {self.min_range} must be less than `max_range` {self.max_range}")
         if self.range_noise < 0:
             raise BeamboxError(f"`range_noise` must be at least 0, got {self.range_noise}")
 
@@ -151,12 +175,7 @@ def load_sensor(sensor: str | Path | Sensor) -> Sensor:
 
 
 def _from_yaml(path: Path) -> Sensor:
-    import yaml
-
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise BeamboxError(f"sensor file {path} is not YAML: {error}") from error
+    values = read_yaml(path)
     if not isinstance(values, dict):
         raise BeamboxError(f"sensor file {path} must hold keys and values, got {type(values).__name__}")
     values.setdefault("name", path.stem)
@@ -173,6 +192,10 @@ def _from_yaml(path: Path) -> Sensor:
                 values[key] = tuple(float(v) for v in values[key])
         for key in set(values) - {"elevations", "offsets", "name"}:
             values[key] = float(values[key])
-    except (TypeError, ValueError) as error:
-        raise BeamboxError(f"sensor file {path}: {key} must be numbers, got {values[key]!r}") from error
-    return Sensor(**values)
+    except (TypeError, ValueError, OverflowError):
+        raise BeamboxError(f"sensor file {path}: {key} must be numbers, got {str(values[key])[:60]!r}") from None
+    values["name"] = str(values["name"])[:100]
+    try:
+        return Sensor(**values)
+    except BeamboxError as error:
+        raise BeamboxError(f"sensor file {path}: {error}") from None

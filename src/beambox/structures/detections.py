@@ -90,6 +90,8 @@ class Detections:
         expect_shape("class_ids", self.class_ids, ("N",))
         expect_same_length(boxes=len(self.boxes), scores=len(self.scores), class_ids=len(self.class_ids))
         ids = self.class_ids
+        if ids.device.type != "cpu":  # a GPU would have to be waited for; they are checked when brought home
+            return
         if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < len(self.classes):
             raise BeamboxError(
                 f"`class_ids` must lie in 0 to {len(self.classes) - 1}, the positions in `classes`, "
@@ -102,7 +104,7 @@ class Detections:
         return len(self.scores)
 
     @overload
-    def __getitem__(self, index: Index) -> Detections: ...
+    def __getitem__(self, index: Index) -> Detections: ...  # pyright: ignore[reportOverlappingOverload]
     @overload
     def __getitem__(self, index: SupportsIndex) -> Detection: ...
     def __getitem__(self, index: SupportsIndex | Index) -> Detection | Detections:

@@ -105,7 +105,7 @@ class Frame:
         return len(self.points)
 
     @overload
-    def __getitem__(self, index: Index) -> Frame: ...
+    def __getitem__(self, index: Index) -> Frame: ...  # pyright: ignore[reportOverlappingOverload]
     @overload
     def __getitem__(self, index: SupportsIndex) -> Tensor: ...
     def __getitem__(self, index: SupportsIndex | Index) -> Tensor | Frame:

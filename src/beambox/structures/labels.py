@@ -130,7 +130,7 @@ class Labels:
         return len(self.names)
 
     @overload
-    def __getitem__(self, index: Index) -> Labels: ...
+    def __getitem__(self, index: Index) -> Labels: ...  # pyright: ignore[reportOverlappingOverload]
     @overload
     def __getitem__(self, index: SupportsIndex) -> Label: ...
     def __getitem__(self, index: SupportsIndex | Index) -> Label | Labels:

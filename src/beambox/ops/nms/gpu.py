@@ -42,7 +42,8 @@ def nms_of_samples(boxes: Tensor, count: Tensor, threshold: float, post: int) ->
         overlaps = torch.empty((samples, places, words), dtype=torch.int64, device=boxes.device)
         limit = constant((float(threshold),), boxes.device, torch.float64)  # as a number it would be float32
         prepared = prepare(boxes.reshape(-1, 7))
-        _mark[(triton.cdiv(places, ROWS), words, samples)](prepared, overlaps, count, places, words, limit, ROWS)
+        grid = (triton.cdiv(places, ROWS), words, samples)
+        _mark[grid](prepared, overlaps, count, places, words, limit, ROWS, num_warps=8)
         width = triton.next_power_of_2(words)
         _walk[(samples,)](overlaps, count, kept, number, places, words, post, width, num_warps=4 if width <= 64 else 8)
     return kept, number

@@ -1,6 +1,6 @@
 """Sums, means and maxima over groups of rows, and rows laid onto a bird's-eye-view map.
 
-While ``torch.export`` traces a network, no value is known that could be checked: then ``graph.py`` runs.
+While ``torch.export`` traces a network, no value is known that could be checked: then ``graph.py`` runs, unchecked.
 """
 
 from __future__ import annotations
@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
+from beambox.ops.dispatch import (
+    Backend,
+    always,
+    can_run_graph,
+    can_run_numba,
+    can_run_triton,
+    choose,
+    exporting,
+    waiting_is_dear,
+)
 from beambox.ops.scatter import graph, reference
 
 __all__ = ["scatter_bev", "segment_max", "segment_mean", "segment_sum"]
@@ -42,17 +51,26 @@ def _triton_mean() -> Callable[..., Tensor]:
 
 
 SUM_BACKENDS = (
+    Backend("graph", can_run_graph, lambda: graph.segment_sum),
     Backend("triton", can_run_triton, _triton_sum),
     Backend("reference", always, lambda: reference.segment_sum),
 )
 MEAN_BACKENDS = (
+    Backend("graph", can_run_graph, lambda: graph.segment_mean),
     Backend("triton", can_run_triton, _triton_mean),
     Backend("reference", always, lambda: reference.segment_mean),
 )
 MAX_BACKENDS = (
+    Backend("graph", can_run_graph, lambda: graph.segment_max),
     Backend("triton", can_run_triton, _triton_max),
     Backend("numba", can_run_numba, _numba_max),
     Backend("reference", always, lambda: reference.segment_max),
+)
+
+
+BEV_BACKENDS = (
+    Backend("graph", can_run_graph, lambda: graph.scatter_bev),
+    Backend("reference", always, lambda: reference.scatter_bev),
 )
 
 
@@ -70,16 +88,12 @@ def segment_sum(values: Tensor, segment: Tensor, size: int) -> Tensor:
     Raises:
         BeamboxError: if a shape or type does not fit, or, on the CPU, a segment is out of range.
     """
-    if torch.compiler.is_exporting():
-        return graph.segment_sum(values, segment, size)
     _check(values, segment, size)
     return choose("segment_sum", SUM_BACKENDS, values, segment)(values, segment, size)
 
 
 def segment_mean(values: Tensor, segment: Tensor, size: int) -> Tensor:
     """Average the rows of each segment; arguments and errors as in :func:`segment_sum`."""
-    if torch.compiler.is_exporting():
-        return graph.segment_mean(values, segment, size)
     _check(values, segment, size)
     return choose("segment_mean", MEAN_BACKENDS, values, segment)(values, segment, size)
 
@@ -90,8 +104,6 @@ def segment_max(values: Tensor, segment: Tensor, size: int) -> Tensor:
     The gradient goes to one row: the first of those that hold the maximum, on every backend. A NaN counts as larger
     than any number, so it is seen rather than skipped. Zero where a segment has no row.
     """
-    if torch.compiler.is_exporting():
-        return graph.segment_max(values, segment, size)
     _check(values, segment, size)
     return choose("segment_max", MAX_BACKENDS, values, segment)(values, segment, size)
 
@@ -111,30 +123,36 @@ def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[in
     Raises:
         BeamboxError: if a shape or type does not fit, or, on the CPU, an index leaves the map.
     """
-    if torch.compiler.is_exporting():
-        return graph.scatter_bev(features, index, batch_size, size)
-    expect_shape("features", features, (None, None))
-    expect_shape("index", index, (len(features), 4))
-    expect_dtype("index", index, torch.int64)
-    ny, nx = size
-    if len(index) and index.device.type == "cpu":  # a GPU would have to be waited for
-        low, high = index.amin(0).tolist(), index.amax(0).tolist()
-        if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
-            raise BeamboxError(
-                f"`index` (sample, z, y, x) must lie below ({batch_size}, any, {ny}, {nx}) and not below 0, "
-                f"got {tuple(low)} .. {tuple(high)}"
-            )
-    return reference.scatter_bev(features, index, batch_size, size)
+    _check_bev(features, index, batch_size, size)
+    return choose("scatter_bev", BEV_BACKENDS, features, index)(features, index, batch_size, size)
 
 
 def _check(values: Tensor, segment: Tensor, size: int) -> None:
+    if exporting():  # asking for a length would fix it in the graph
+        return
     expect_shape("values", values, (None, None))
     if not values.is_floating_point():
         raise BeamboxError(f"`values` must be floating point, got {str(values.dtype).removeprefix('torch.')}")
     expect_shape("segment", segment, (None,))
     expect_dtype("segment", segment, torch.int64)
     expect_same_length(values=len(values), segment=len(segment))
-    if len(segment) and segment.device.type == "cpu":  # a GPU would have to be waited for
+    if len(segment) and not waiting_is_dear(segment):  # a GPU would have to be waited for
         low, high = (int(value) for value in segment.aminmax())
         if low < 0 or high >= size:
             raise BeamboxError(f"`segment` must lie in 0 .. {size - 1} (size {size}), got {low} .. {high}")
+
+
+def _check_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[int, int]) -> None:
+    if exporting():  # asking for a length would fix it in the graph
+        return
+    expect_shape("features", features, (None, None))
+    expect_shape("index", index, (len(features), 4))
+    expect_dtype("index", index, torch.int64)
+    ny, nx = size
+    if len(index) and not waiting_is_dear(index):  # a GPU would have to be waited for
+        low, high = index.amin(0).tolist(), index.amax(0).tolist()
+        if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
+            raise BeamboxError(
+                f"`index` (sample, z, y, x) must lie below ({batch_size}, any, {ny}, {nx}) and not below 0, "
+                f"got {tuple(low)} .. {tuple(high)}"
+            )

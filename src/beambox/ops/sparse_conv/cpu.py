@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from beambox.ops.jit import jit, run_in_blocks
 from beambox.ops.sparse_conv.autograd import convolve_with
-from beambox.ops.sparse_conv.cpu_maps import BLOCK, BlockPairs
+from beambox.ops.sparse_conv.cpu_maps import BLOCK, BlockPairs, block_pairs
 from beambox.ops.sparse_conv.sites import KernelMap
 from beambox.ops.sparse_conv.tiles import ROWS, VECTOR_BYTES, WIDE, multiply_rows, outer_products
 
@@ -43,7 +43,7 @@ def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
 def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Compute the convolution without recording gradients: ``(V_in, C_in)`` -> ``(V_out, C_out)``."""
     rows, c_out = len(pairs.target), weight.shape[2]
-    blocks = pairs.blocks
+    blocks = pairs.kept(block_pairs)
     out = features.new_empty((rows + len(blocks.count), c_out + -c_out % _lanes(weight)))
     start = _filled(features.new_zeros(c_out) if bias is None else bias).numpy()
     x, w, y = features.contiguous().numpy(), _filled(weight).contiguous().numpy(), out.numpy()
@@ -58,7 +58,7 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
 def accumulate(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
     """Compute the gradient of the weights: ``(K, C_in, C_out)``."""
     c_in, c_out = features.shape[1], grad.shape[1]
-    blocks = pairs.blocks
+    blocks = pairs.kept(block_pairs)
     x = functional.pad(features, (0, -c_in % ROWS)).contiguous().numpy()
     g = _filled(grad).contiguous().numpy()
     out = features.new_zeros((pairs.geometry.offsets, x.shape[1], g.shape[1]))
@@ -89,7 +89,7 @@ def accumulate_half(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
 
 def _side_by_side(features: Tensor, pairs: KernelMap) -> Iterator[tuple[int, Tensor]]:
     """Yield, for stretches of outputs in ascending order, the rows each sees: ``(rows, K * C_in)``, zero for none."""
-    order, blocks = pairs.target.order, pairs.blocks
+    order, blocks = pairs.target.order, pairs.kept(block_pairs)
     place = torch.empty_like(order)
     place[order] = torch.arange(len(order))
     width = blocks.count.shape[1] * features.shape[1]

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from beambox.ops.jit import jit, run_in_blocks
-from beambox.ops.sparse_conv.sites import Geometry, Sites, Triple
+from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple
 from beambox.ops.sparse_conv.tiles import ROWS
 
-__all__ = ["BLOCK", "BlockPairs", "find_pairs", "find_targets", "table_of"]
+__all__ = ["BLOCK", "BlockPairs", "block_pairs", "find_pairs", "find_targets"]
 
 BLOCK = 256
 """Output rows worked on together, a multiple of the tile's: their sums stay in the second-level cache."""
@@ -93,6 +93,11 @@ def _reached(keys, shape, out_shape, z_table, y_table, x_table):
                         out[n] = last[of_line]
                         n += 1
     return out[:n].copy()
+
+
+def block_pairs(pairs: KernelMap) -> BlockPairs:
+    """Build a map's pairs grouped as the CPU works on them; to be kept with the map: ``pairs.kept(block_pairs)``."""
+    return find_pairs(pairs.source, pairs.target, pairs.geometry, pairs.mirror is not None)
 
 
 def find_pairs(source: Sites, target: Sites, geometry: Geometry, back: bool) -> BlockPairs:
@@ -192,18 +197,3 @@ def _spans(table):
                 low[i] = place if high[i] < 0 else min(low[i], place)
                 high[i] = max(high[i], place)
     return low, high
-
-
-def table_of(pairs: BlockPairs, rows: int) -> Tensor:
-    """Write pairs as a table ``(V_out, K)`` int32 of input rows, -1 for none."""
-    table = np.full((rows, pairs.count.shape[1]), -1, np.int32)
-    _fill_table(pairs.source, pairs.target, pairs.count, table)
-    return torch.from_numpy(table)
-
-
-@jit
-def _fill_table(source, target, count, table):
-    for block in range(count.shape[0]):
-        for k in range(count.shape[1]):
-            for place in range(count[block, k]):
-                table[target[block, k, place], k] = source[block, k, place]

@@ -15,6 +15,7 @@ import triton.language as tl
 from torch import Tensor
 
 from beambox.ops.sparse_conv.autograd import convolve_with
+from beambox.ops.sparse_conv.pairs import input_rows
 from beambox.ops.sparse_conv.sites import KernelMap
 
 __all__ = ["accumulate", "convolve", "multiply"]
@@ -37,7 +38,7 @@ def _width(channels: int) -> int:
 
 def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Compute the convolution without recording gradients: ``(V_in, C_in)`` -> ``(V_out, C_out)``."""
-    table = pairs.table
+    table = pairs.kept(input_rows)
     rows, offsets = table.shape
     c_in, c_out = weight.shape[1:]
     out = features.new_empty((rows, c_out))
@@ -63,7 +64,7 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
 
 def accumulate(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
     """Compute the gradient of the weights: ``(K, C_in, C_out)``."""
-    table = pairs.table
+    table = pairs.kept(input_rows)
     rows, offsets = table.shape
     c_in, c_out = features.shape[1], grad.shape[1]
     if rows == 0 or len(features) == 0:

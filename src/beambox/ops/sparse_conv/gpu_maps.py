@@ -17,7 +17,7 @@ from torch import Tensor
 
 from beambox.ops.sparse_conv.sites import Geometry, Sites
 
-__all__ = ["find_levels", "indices_of", "inverse_table", "neighbour_table"]
+__all__ = ["find_levels", "inverse_table", "neighbour_table"]
 
 BLOCK = 128
 
@@ -63,18 +63,8 @@ def find_levels(source: Sites, geometries: Sequence[Geometry]) -> list[Sites]:
     return [Sites.from_keys(keys, shape, batch) for keys, shape in zip(found, shapes)]
 
 
-def indices_of(sites: Sites) -> Tensor:
-    """Return ``(V, 4)`` int64 (b, z, y, x) of each row."""
-    indices = torch.empty((len(sites), 4), dtype=torch.int64, device=sites.sorted_keys.device)
-    if len(sites):
-        _take_apart[(triton.cdiv(len(sites), 256),)](
-            sites.sorted_keys, sites.order, indices, len(sites), *sites.shape, 256
-        )
-    return indices
-
-
 @triton.jit
-def _look_up(
+def _look_up(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     keys, order, target_keys, target_order, table, rows, sources, steps, tz, ty, tx, nz, ny, nx, offsets, ky, kx,
     sz, sy, sx, pz, py, px, dz, dy, dx, block: tl.constexpr,
 ):  # fmt: skip
@@ -110,7 +100,7 @@ def _turn_round(forward, back, total, offsets, block: tl.constexpr):
 
 
 @triton.jit
-def _spread(
+def _spread(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     source, active, count, listed: tl.constexpr, nz, ny, nx, tz, ty, tx, kz, ky, kx, sz, sy, sx, pz, py, px, dz, dy, dx,
     block: tl.constexpr,
 ):  # fmt: skip
@@ -131,16 +121,3 @@ def _spread(
             at_z, at_y, at_x = at_z // sz, at_y // sy, at_x // sx
             lands = lands & (at_z < tz) & (at_y < ty) & (at_x < tx)
             tl.store(active + ((b * tz + at_z) * ty + at_y) * tx + at_x, 1, lands)
-
-
-@triton.jit
-def _take_apart(keys, order, indices, rows, nz, ny, nx, block: tl.constexpr):
-    """Write the four indices of a block of keys."""
-    at = tl.program_id(0) * block + tl.arange(0, block)
-    has = at < rows
-    key = tl.load(keys + at, has, 0)
-    place = indices + tl.load(order + at, has, 0) * 4
-    tl.store(place, key // nx // ny // nz, has)
-    tl.store(place + 1, key // nx // ny % nz, has)
-    tl.store(place + 2, key // nx % ny, has)
-    tl.store(place + 3, key % nx, has)

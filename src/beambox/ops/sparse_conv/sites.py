@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,12 +14,10 @@ from torch import Tensor
 from beambox.checks import BeamboxError, expect_shape
 from beambox.ops.dispatch import Backend, always, can_run_triton, choose
 
-if TYPE_CHECKING:
-    from beambox.ops.sparse_conv.cpu_maps import BlockPairs
-
 __all__ = ["Geometry", "KernelMap", "Sites", "Triple"]
 
 Triple = tuple[int, int, int]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -83,50 +81,31 @@ class Geometry:
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
 
 
-def _table() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.reference import neighbour_table
-
-    return neighbour_table
-
-
-def _inverse() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.reference import inverse_table
-
-    return inverse_table
-
-
-def _indices() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.reference import indices_of
-
-    return indices_of
-
-
-def _triton_table() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.gpu_maps import neighbour_table
-
-    return neighbour_table
-
-
-def _triton_inverse() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.gpu_maps import inverse_table
-
-    return inverse_table
-
-
 def _triton_indices() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.gpu_maps import indices_of
+    from beambox.ops.sparse_conv.gpu_indices import indices_of
 
     return indices_of
 
 
-TABLE_BACKENDS = (Backend("triton", can_run_triton, _triton_table), Backend("reference", always, _table))
-INVERSE_BACKENDS = (Backend("triton", can_run_triton, _triton_inverse), Backend("reference", always, _inverse))
-INDEX_BACKENDS = (Backend("triton", can_run_triton, _triton_indices), Backend("reference", always, _indices))
+def indices_of(keys: Tensor, order: Tensor, shape: Triple) -> Tensor:
+    """Return ``(V, 4)`` int64 (b, z, y, x) of each row from ``(V,)`` ascending keys and the row of each."""
+    nz, ny, nx = shape
+    rest, x = keys // nx, keys % nx
+    rest, y = rest // ny, rest % ny
+    ascending = torch.stack((rest // nz, rest % nz, y, x), dim=1)
+    return torch.empty_like(ascending).index_copy_(0, order, ascending)
+
+
+INDEX_BACKENDS = (Backend("triton", can_run_triton, _triton_indices), Backend("reference", always, lambda: indices_of))
 
 
 @dataclass(frozen=True, eq=False)
 class KernelMap:
-    """Which input site feeds which output site through which kernel offset; found when first asked for."""
+    """Which input site feeds which output site through which kernel offset.
+
+    A record of the two sets of sites and the geometry between them. Each backend builds the pairs in the form that
+    suits it when it first needs them, and keeps them here.
+    """
 
     source: Sites
     """The ``V_in`` input sites."""
@@ -136,29 +115,19 @@ class KernelMap:
     """Of the convolution, or of the one that this map inverts."""
     mirror: KernelMap | None = None
     """The map of which this one is the inverse, if it is one."""
+    built: dict[Callable[[KernelMap], Any], Any] = field(default_factory=dict, repr=False)
+    """What backends have built from it."""
 
     @cached_property
     def inverse(self) -> KernelMap:
         """The same pairs read from output to input: the map of the transposed convolution and of gradients."""
         return self.mirror or KernelMap(self.target, self.source, self.geometry, self)
 
-    @cached_property
-    def table(self) -> Tensor:
-        """``(V_out, K)`` int32 row of the input site that reaches an output through an offset, or -1."""
-        if self.mirror is None:
-            look_up = choose("neighbour_table", TABLE_BACKENDS, self.source.sorted_keys)
-            return look_up(self.source, self.target, self.geometry)
-        forward = self.mirror.table
-        if self.geometry.submanifold:
-            return forward.flip(1).contiguous()  # a centred kernel mirrors itself
-        return choose("inverse_table", INVERSE_BACKENDS, forward)(forward, len(self.target))
-
-    @cached_property
-    def blocks(self) -> BlockPairs:
-        """The same pairs grouped as the CPU works on them."""
-        from beambox.ops.sparse_conv.cpu_maps import find_pairs
-
-        return find_pairs(self.source, self.target, self.geometry, self.mirror is not None)
+    def kept(self, build: Callable[[KernelMap], T]) -> T:
+        """Return what a backend builds from this map, such as a table of rows; built once and kept with the map."""
+        if build not in self.built:
+            self.built[build] = build(self)
+        return self.built[build]
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +151,7 @@ class Sites:
     @cached_property
     def indices(self) -> Tensor:
         """``(V, 4)`` int64 (b, z, y, x) of each row."""
-        return choose("site_indices", INDEX_BACKENDS, self.sorted_keys)(self)
+        return choose("site_indices", INDEX_BACKENDS, self.sorted_keys)(self.sorted_keys, self.order, self.shape)
 
     def __len__(self) -> int:
         return len(self.sorted_keys)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_dtype, expect_same_length, expect_shape
 from beambox.geometry.grid import VoxelGrid
-from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose
+from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose, waiting_is_dear
 from beambox.ops.voxelize import reference
 from beambox.ops.voxelize.voxels import Voxels
 
@@ -72,7 +72,7 @@ def voxelize(
     for name, limit in (("max_points", max_points), ("max_voxels", max_voxels)):
         if limit is not None and limit < 1:
             raise BeamboxError(f"`{name}` must be at least 1, or None for no limit, got {limit}")
-    if len(sample) and sample.device.type == "cpu":  # a GPU would have to be waited for
+    if len(sample) and not waiting_is_dear(sample):  # a GPU would have to be waited for
         low, high = (int(value) for value in sample.aminmax())
         if low < 0 or high >= batch_size:
             raise BeamboxError(

@@ -1,0 +1,1 @@
+"""Labels of common annotation tools, read and written; see docs/label_formats.md."""
