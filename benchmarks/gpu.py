@@ -49,8 +49,7 @@ def plan() -> list[Group]:
     groups += [Group(f"ops:{name}", 120, 1) for name in ops]
     groups += [Group(f"same:{name}", 150, 1) for name in DETECTORS]
     groups += [Group("peaks", 45, 2)]
-    groups += [Group(f"latency:{name}", 60, 3 + i) for i, name in enumerate(DETECTORS)]
-    groups += [Group(f"train:{name}", 45, 20 + i) for i, name in enumerate(DETECTORS)]
+    groups += [Group(f"speed:{name}", 60, 3 + i) for i, name in enumerate(DETECTORS)]
     groups += [Group("tests", 180, 40)]
     return groups
 
@@ -191,7 +190,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=8.0, help="stop after so long")
     parser.add_argument("--device", default="cuda", choices=["cuda", "cpu"])
     parser.add_argument("--quick", action="store_true", help="once and small, to try the script")
-    parser.add_argument("--only", nargs="*", metavar="GROUP", help="some groups, by name or by the part before ':'")
+    parser.add_argument("--only", nargs="*", metavar="GROUP", help="some, by name (speed:dennet) or kind (speed)")
     parser.add_argument(
         "--lanes", type=int, default=max(1, min(8, (os.cpu_count() or 2) // 2)), help="processes at once"
     )
@@ -199,7 +198,8 @@ def main() -> None:
     arguments = parser.parse_args()
     groups = plan()
     if arguments.only:
-        wanted = {"frames", *arguments.only}
+        wanted = {"environment", "frames"}.union(*(word.split(",") for word in arguments.only))
+        wanted |= {"speed"} if wanted & {"latency", "train"} else set()
         groups = [g for g in groups if g.name in wanted or g.name.split(":")[0] in wanted]
     if arguments.list:
         print("\n".join(group.name for group in groups))

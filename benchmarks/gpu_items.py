@@ -175,10 +175,8 @@ def items_of(group: str, setting: Setting) -> list[Item]:
 
     if kind == "peaks":
         return gpu_speed.peaks(setting)
-    if kind == "latency":
-        return gpu_speed.latency(name, setting)
-    if kind == "train":
-        return gpu_speed.training(name, setting)
+    if kind == "speed":
+        return [*gpu_speed.latency(name, setting), *gpu_speed.training(name, setting)]
     raise SystemExit(f"no group is called {group}")
 
 

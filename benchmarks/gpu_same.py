@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import os
 import re
 import subprocess
@@ -26,7 +27,7 @@ def recipe_of(name: str) -> Any:
     """Return a detector's recipe for KITTI, with all the width it has."""
     from beambox.train.config import read_recipe
 
-    return read_recipe(ROOT / "recipes" / f"{name.replace('_', '')}_kitti.yaml")
+    return read_recipe(f"{name}-kitti-3class")
 
 
 def full_width(name: str) -> nn.Module:
@@ -89,7 +90,7 @@ def agreement(got: Any, want: Any) -> dict[str, Any]:
         return told | {"ok": len(got) == len(want)}
     got = got.to("cpu")
     distance = (got.boxes[:, None] - want.boxes[None]).abs().amax(dim=2)
-    distance = torch.where(got.labels[:, None] == want.labels[None], distance, torch.inf)
+    distance = torch.where(got.class_ids[:, None] == want.class_ids[None], distance, torch.inf)
     nearest, row = distance.min(dim=1)
     same = nearest < 1e-2
     told["matched"] = int(same.sum())
@@ -137,35 +138,47 @@ def lower_precision(name: str, setting: Setting, shipped: bool) -> dict[str, Any
     return told
 
 
-def losses(name: str, setting: Setting) -> dict[str, Any]:
-    """Compare losses and gradients of a training pass in float32; second stages draw their regions alike."""
+def learnt(model: Any, batch: Any, grid: Any) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """Return the losses and gradients of one training pass."""
+    model.zero_grad(set_to_none=True)
+    torch.manual_seed(7)  # on every device, regions are drawn by the CPU's generator
+    takes_labels = "labels" in inspect.signature(model.forward).parameters
+    predictions = model(batch, grid, labels=batch.labels) if takes_labels else model(batch, grid)
+    named = model.loss(predictions, batch.labels)
+    torch.stack(list(named.values())).sum().backward()
+    gradients = {k: p.grad.detach().cpu().clone() for k, p in model.named_parameters() if p.grad is not None}
+    return {k: float(v.detach()) for k, v in named.items()}, gradients
+
+
+def losses(name: str, setting: Setting, dtype: torch.dtype) -> dict[str, Any]:
+    """Compare losses and gradients of a training pass over a window ahead.
+
+    In float32 rounding may change the order of proposals, and with it the regions that a second stage learns from;
+    so its parameters are judged in float64 alone, where such ties do not occur.
+    """
     exactly()
-    model = full_width(name).train()
+    model = full_width(name).train().to(dtype)
     for layer in model.modules():
         if isinstance(layer, nn.Dropout):
             layer.p = 0.0
-    batch = setting.batch(1 if setting.quick else 2)
-    results = []
-    for device in ("cpu", setting.device):
-        there = model.to(device)
-        there.zero_grad(set_to_none=True)
-        torch.manual_seed(7)  # on both, regions are drawn by the CPU's generator
-        predictions = there(batch.to(device))
-        named = there.loss(predictions, batch.labels)
-        torch.stack(list(named.values())).sum().backward()
-        gradients = {k: p.grad.detach().cpu().clone() for k, p in there.named_parameters() if p.grad is not None}
-        results.append(({k: float(v) for k, v in named.items()}, gradients))
-    (want, theirs), (got, ours) = results
-    off = {k: abs(got[k] - want[k]) / max(abs(want[k]), 1e-6) for k in want}
+    whole, batch = model.config.grid, setting.batch(1)
+    cells = tuple(min(n, 256) // 8 * 8 for n in whole.size[:2])
+    grid = whole.window((0, (whole.size[1] - cells[1]) // 2 // 8 * 8), cells)
+    batch = dataclasses.replace(batch, points=batch.points.to(dtype))
+    want, theirs = learnt(model, batch, grid)
+    got, ours = learnt(model.to(setting.device), batch.to(setting.device), grid)
+    tight = dtype == torch.float64
+    judged = [k for k in theirs if tight or not k.startswith("roi_")]
+    off = {k: abs(got[k] - want[k]) / max(abs(want[k]), 1e-6) for k in want if tight or not k.startswith("roi_")}
     # Where a gradient is the difference of large terms (weights before a batch norm), rounding is all there is.
-    norms = {k: float(v.norm()) for k, v in theirs.items()}
-    largest = max(norms.values())
-    wrong = {k: error(ours[k], theirs[k]) for k in theirs if norms[k] > 1e-3 * largest}
+    norms = {k: float(theirs[k].norm()) for k in judged}
+    wrong = {k: error(ours[k], theirs[k]) for k in judged if norms[k] > 1e-3 * max(norms.values())}
     worst = sorted(wrong, key=lambda k: -wrong[k])[:5]
+    limit = 1e-4 if tight else 5e-2
     return {
-        "ok": max(off.values()) < 1e-2 and set(ours) == set(theirs) and max(wrong.values()) < 5e-2,
+        "ok": max(off.values()) < limit and set(ours) == set(theirs) and max(wrong.values()) < limit,
         "worst": max(wrong.values()),
-        "limit": 5e-2,
+        "limit": limit,
         "losses": {k: [got[k], want[k]] for k in want},
         "gradients": {k: wrong[k] for k in worst},
     }
@@ -177,7 +190,8 @@ def items(name: str, setting: Setting) -> list[Item]:
     if name in SHIPPED:
         pairs += [("shipped weights", lambda: detections(name, setting, True))]
         pairs += [("shipped weights in bfloat16", lambda: lower_precision(name, setting, True))]
-    pairs += [("losses and gradients", lambda: losses(name, setting))]
+    for dtype in (torch.float64, torch.float32):
+        pairs += [(f"losses and gradients, {dtype}", lambda d=dtype: losses(name, setting, d))]
     return [*pairs, ("random weights, full width", lambda: detections(name, setting, False))]
 
 

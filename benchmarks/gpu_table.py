@@ -59,7 +59,7 @@ def speed(report: Report) -> list[str]:
         f"{'of peak':>8} {'of copy':>8} {'launches':>9} {'waits':>6} {'kernels':>8} {'MB':>7}"
     ]
     for name in DETECTORS:
-        told = items(report, f"latency:{name}")
+        told = items(report, f"speed:{name}")
         main = "bfloat16" if "bfloat16 batch 1" in told else "float32"
         one, eight, plain = (told.get(k, {}) for k in (f"{main} batch 1", f"{main} batch 8", "float32 batch 1"))
         work, launches, waits = (told.get(k, {}) for k in ("work, batch 1", "launches, batch 1", "waits, batch 1"))
@@ -75,7 +75,7 @@ def speed(report: Report) -> list[str]:
             f"{launches.get('kernels_ms', ''):>8} {one.get('peak_mb', ''):>7}"
         )
     for name in DETECTORS:
-        told = items(report, f"latency:{name}")
+        told = items(report, f"speed:{name}")
         for key in ("bfloat16 batch 1", "float32 batch 1"):
             stages = told.get(key, {}).get("stages")
             if stages:
@@ -88,7 +88,7 @@ def steps(report: Report) -> list[str]:
     """Training."""
     lines = [f"{'training':14} {'steps/s':>8} {'sweeps/s':>9} {'batch':>6} {'peak MB':>9}  ms"]
     for name in DETECTORS:
-        for key, told in items(report, f"train:{name}").items():
+        for key, told in items(report, f"speed:{name}").items():
             if "steps_per_s" in told:
                 parts = ", ".join(f"{k} {v}" for k, v in told["stages_ms"].items())
                 lines.append(

@@ -1,7 +1,7 @@
 """Train a recipe on a borrowed machine for as long as there is: packed data in, a checkpoint in small files out.
 
-    python benchmarks/gpu_train.py recipes/pointpillars_kitti.yaml --data kitti.pack --minutes 8 --out OUT
-    python benchmarks/gpu_train.py recipes/pointpillars_kitti.yaml --data kitti.pack --minutes 8 --out OUT --resume OLD
+    python benchmarks/gpu_train.py pointpillars-kitti-3class --data kitti.pack --minutes 8 --out OUT
+    python benchmarks/gpu_train.py pointpillars-kitti-3class --data kitti.pack --minutes 8 --out OUT --resume OLD
 
 Data is a file of benchmarks/pack_frames.py, or a folder in KITTI's layout. `--simulate N` adds N simulated sweeps, made
 first by all cores. The run is the project's own (`beambox.train`), with its augmentation and its data workers; only its
@@ -69,7 +69,7 @@ class Clock:
 
     def finishing(self) -> float:
         """Seconds to keep for exact statistics (a forward pass of 60 steps, new data workers) and for writing."""
-        return 20.0 + 40 * (self.pace or 0.2)
+        return 30.0 + 40 * (self.pace or 0.2)
 
     def left(self) -> float:
         """Seconds of training left in this sitting."""
@@ -292,7 +292,7 @@ def sitting(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
 def main() -> None:
     began = time.monotonic()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("recipe", type=Path)
+    parser.add_argument("recipe", help="name or file")
     parser.add_argument("--data", type=Path, required=True, help="packed file, or a folder in KITTI's layout")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=8.0, help="of everything, from the start of this program")

@@ -79,13 +79,13 @@ def test_evaluate_scores_once_by_its_own_rules(tmp_path: Path, capsys: pytest.Ca
     write_once_sequence(tmp_path, "000001", frames)
     write_once_split(tmp_path, "val", ["000001"])
     words = ["evaluate", tiny_weights(tmp_path), "--data", tmp_path, "--json", tmp_path / "ap.json"]
-    ran = beambox(capsys, *words, "--published", "--iou", "Vehicle=0.3")
+    ran = beambox(capsys, *words, "--published", "--iou", "Vehicle=0.7,Vehicle=0.3")
     assert ran.status == 0, ran.err
     assert ran.out.count("ONCE AP in percent, 2 frames") == 2 and "Vehicle > 0.30" in ran.out
     assert "not measured here" in ran.out
     scores = json.loads((tmp_path / "ap.json").read_text(encoding="utf-8"))
-    assert list(scores) == ["default", "given"]
-    assert list(scores["default"]) == ["Vehicle", "Pedestrian", "Cyclist", "mean"]
+    assert list(scores) == ["Vehicle", "Pedestrian", "Cyclist", "mean", "Vehicle@0.3"]
+    assert [scores[name]["iou"] for name in ("Vehicle", "Vehicle@0.3")] == [0.7, 0.3]
 
 
 def test_training_takes_described_data(tmp_path: Path) -> None:

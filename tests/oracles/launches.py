@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -25,6 +26,12 @@ READS = (
     "bincount",
 )
 """Operations whose answer, or the size of it, the host waits for."""
+NOTHING = ("detach_", "lift_fresh")
+"""Operations that compute nothing."""
+TAKEN_HOME = ("tolist", "cpu", "numpy", "__array__")
+"""Methods that hand a tensor's values to the host; where it lies there already, no operation shows it."""
+SENT = ("tensor", "as_tensor", "from_numpy", "new_tensor", "asarray")
+"""Functions that bring numbers of the host to a device, which waits for it as a reading does."""
 
 
 class Launches(TorchDispatchMode):
@@ -39,13 +46,24 @@ class Launches(TorchDispatchMode):
         """By name."""
         self.reads: Counter[str] = Counter()
         """By name."""
+        self.sent: Counter[str] = Counter()
+        """Numbers brought from the host, by name."""
         self.bytes = 0
         """Of all arguments and results, as if each operation read and wrote every one once."""
+
+    def __enter__(self) -> Launches:
+        self._calls = _Calls(self)
+        self._calls.__enter__()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        self._calls.__exit__(*error)
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
         name = func.overloadpacket._qualified_op_name.split("::")[-1]
-        if is_view(func):
+        if is_view(func) or name in NOTHING:
             return out
         self.operations[name] += 1
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
@@ -53,6 +71,29 @@ class Launches(TorchDispatchMode):
         self.bytes += sum(tensor.numel() * tensor.element_size() for tensor in (*given, *made))
         if name in READS or reads_by_mask(name, given) or goes_home(name, given, made):
             self.reads[name] += 1
+        return out
+
+
+class _Calls(TorchFunctionMode):
+    """Tells of calls that move values between the host and a device, whatever device it is."""
+
+    def __init__(self, launches: Launches) -> None:
+        super().__init__()
+        self.launches = launches
+        self.home: dict[int, Tensor] = {}
+        """What was brought home, by its place, kept so that nothing else comes to lie there."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = getattr(func, "__name__", "")
+        if name in SENT:
+            self.launches.sent[name] += 1
+        out = func(*args, **(kwargs or {}))
+        if name in TAKEN_HOME:
+            place = args[0].untyped_storage().data_ptr()
+            if place not in self.home:  # what was brought home is read there without waiting
+                self.launches.reads[name] += 1
+            if name == "cpu":
+                self.home[place] = out
         return out
 
 

@@ -93,3 +93,19 @@ def test_command_writes_a_data_set(tmp_path) -> None:
     yaml.write_text("elevations: [-2, -4, -6]\nazimuth_step: 1.0\nheight: 1.7\n")
     command(tmp_path / "d", frames=2, sensor=str(yaml), view="full", seed=4)
     assert len(KittiSource(tmp_path / "d", "all")) == 2
+
+
+@pytest.mark.parametrize(
+    ("share", "frames", "expected"), [(0.3, 10, 3), (0.1, 25, 2), (0.5, 3, 2), (0.0, 4, 0), (0.2, 1, 0)]
+)
+def test_the_share_for_validation_is_exact(share: float, frames: int, expected: int, tmp_path: Path) -> None:
+    from beambox.simulate.writer import KittiFiles
+
+    files = KittiFiles(str(tmp_path), 0, {}, share)
+    (tmp_path / "training" / "label_2").mkdir(parents=True)
+    for number in range(frames):
+        (tmp_path / "training" / "label_2" / f"{number:06d}.txt").write_text("")
+    files.write_splits()
+    val, train = ((tmp_path / "ImageSets" / f"{name}.txt").read_text().split() for name in ("val", "train"))
+    assert len(val) == expected
+    assert sorted([*val, *train]) == [f"{number:06d}" for number in range(frames)]

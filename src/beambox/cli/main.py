@@ -7,8 +7,10 @@ import functools
 import inspect
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 from beambox import __version__
@@ -26,16 +28,15 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
     "stream": ("beambox.cli.stream:command", "detect and track through a recording; boxes as a recording"),
     "track": ("beambox.cli.track:command", "follow objects through a drive: identities, velocities"),
+    "view": ("beambox.cli.view:command", "sweeps, boxes and cameras in the rerun viewer, live or as a file"),
+    "explain": ("beambox.cli.explain:command", "what the attention of HCNet, KASSD or DenNet looks at, as pictures"),
     "doctor": ("beambox.cli.doctor:command", "why does nothing work, or why are there no detections"),
     "models": ("beambox.cli.models:command", "the shipped weights and where they come from"),
     "simulate": ("beambox.cli.simulate:command", "write a labelled data set of simulated sweeps"),
     "recipes": ("beambox.cli.recipes:command", "the shipped recipes: for whom, how long, whether ever run"),
     "train": ("beambox.cli.train:command", "train a detector by a recipe"),
     "evaluate": ("beambox.cli.evaluate:command", "detect in a labelled data set and score by KITTI's rules"),
-    "report": (
-        "beambox.cli.report:command",
-        "one page per evaluation: curves, errors, groups, worst failures as pictures",
-    ),
+    "report": ("beambox.cli.report:command", "one page per evaluation: curves, errors, worst failures as pictures"),
     "ablate": ("beambox.cli.ablate:command", "train and score the rows of a paper's table; print ours beside theirs"),
     "data": ("beambox.cli.data:app", "check a data set of one's own before training, and propose anchors for it"),
     "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),
@@ -161,8 +162,26 @@ def run(name: str, arguments: Sequence[str]) -> None:
         app.command(name, help=help_of(command), context_settings=settings)(guard(command))
     from beambox.cli.console import plain_output
 
-    with plain_output():
+    with plain_output(), terminated_as_interrupted():
         app(args=list(arguments), prog_name=f"beambox {name}")
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM, as a batch system sends it, end a command the way Ctrl-C does: files whole, drafts removed."""
+
+    def interrupt(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    try:
+        former = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not in the main thread, where signals do not arrive
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
 
 
 def help_of(function: Callable[..., None]) -> str:

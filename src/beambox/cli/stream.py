@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
 from beambox.cli.console import announce, say, show_log
+
+if TYPE_CHECKING:
+    from beambox.infer.predictor import Detector
 
 __all__ = ["command"]
 
@@ -80,6 +83,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     dropped: list[str] = []
     sweeps = arrivals(source, topic, rate=rate, fields=fields or None, intensity_scale=intensity_scale)
     if realtime:
+        warm_up(detector)
         sweeps = in_real_time(sweeps, lambda sweep: dropped.append(sweep.name), speed=speed)
     with recording_writer(out, told) as write:
         report = run_stream(
@@ -95,3 +99,15 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
             raise BeamboxError(f"{source}: no sweep could be read, so nothing was written")
     say(report.text())
     print(f"{report.done} sweeps, {report.objects} boxes -> {out}")
+
+
+def warm_up(detector: Detector) -> None:
+    """Detect once in random points: the first sweep would otherwise wait for what is compiled then."""
+    import torch
+
+    from beambox.structures import Frame
+
+    low, high = torch.tensor(detector.grid.minimum), torch.tensor(detector.grid.maximum)
+    points = torch.rand(20_000, 4, generator=torch.Generator().manual_seed(0))
+    points[:, :3] = low + points[:, :3] * (high - low)
+    detector.detect([Frame(points.float())])

@@ -14,7 +14,9 @@ def command(
     recipe: Annotated[
         str, typer.Argument(help="Name of a shipped recipe (`beambox recipes` lists them), or a YAML file.")
     ],
-    data: Annotated[Path | None, typer.Option(help="Folder that {data} stands for in the recipe.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="What {data} of the recipe stands for: a folder, or a YAML file.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME where not given.")] = None,
     change: Annotated[
         list[str] | None,

@@ -178,6 +178,6 @@ def read_custom_config(path: Path) -> CustomConfig:
         faults = []
         for fault in error.errors():
             place = ".".join(str(part) for part in fault["loc"])
-            text = fault["msg"].removeprefix("Value error, ")
+            text = fault["msg"].removeprefix("Value error, ")[:300]
             faults.append(f"{place}: {text}" if place else text)
-        raise BeamboxError(f"{path}: " + "; ".join(faults)) from None
+        raise BeamboxError(f"{path}: " + "; ".join(faults[:5])) from None

@@ -14,7 +14,9 @@ from beambox.structures import Frame
 
 __all__ = ["MixedSource"]
 
-ORDER = 0  # a stream of random numbers that must not meet others: the object database has 2, training 11 and 12
+# streams of random numbers that must not meet others: the object database has 2, training 11 and 12. A key that ends in
+# zeros is the same stream as one without them, so keys of different lengths need numbers of their own
+ORDER, SHUFFLE = 0, 3
 
 
 @dataclass(frozen=True)
@@ -67,4 +69,4 @@ class MixedSource:
             for k, count in enumerate(counts.tolist())
             if count
         ]
-        return np.random.default_rng((seed, ORDER, epoch)).permutation(np.concatenate(parts))
+        return np.random.default_rng((seed, SHUFFLE, epoch)).permutation(np.concatenate(parts))

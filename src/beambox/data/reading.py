@@ -183,7 +183,7 @@ def _assemble(columns: Columns, where: str, fields: tuple[str, ...] | None, scal
     if lacking:
         raise BeamboxError(
             f"{where} must have columns x, y and z; {' and '.join(lacking)} not found among "
-            f"{', '.join(columns.names) or 'none'}"
+            f"{', '.join(name[:60] for name in columns.names[:30]) or 'none'}"
         )
     taken = {columns.names[k] for k in chosen.values()}
     extra = [name for name in fields or () if name not in (*STANDARD, "_", *taken)]

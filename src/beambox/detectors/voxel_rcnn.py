@@ -161,9 +161,6 @@ class VoxelRcnnPredictions:
 class TwoStage(nn.Module):
     """What Voxel R-CNN shares with its successors: all but the 2-D network and what feeds it."""
 
-    backbone: BevBackbone
-    """The 2-D network, which a successor sets."""
-
     def __init__(self, config: VoxelRcnnConfig) -> None:
         super().__init__()
         self.config = config
@@ -193,11 +190,6 @@ class TwoStage(nn.Module):
         """Return the encoder's features that the second stage pools, one for each level of the pooling."""
         by_stride = {2: stages.stride2, 4: stages.stride4, 8: stages.stride8}
         return [by_stride[level.stride] for level in self.config.pooling]
-
-    @property
-    def dense(self) -> tuple[nn.Module, ...]:
-        """Layers that work on whole maps."""
-        return (self.backbone,)
 
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""
@@ -260,6 +252,11 @@ class VoxelRcnn(TwoStage):
         pooled = self.roi_pool(rois, self.levels(stages), grid)  # (R, 6 * 6 * 6 * 96)
         refined = self.roi_head(pooled)
         return VoxelRcnnPredictions(first, rois, refined, targets)
+
+    @property
+    def dense(self) -> tuple[nn.Module, ...]:
+        """Layers that work on whole maps."""
+        return (self.backbone,)
 
 
 def voxel_rcnn(config: VoxelRcnnConfig | None = None) -> VoxelRcnn:

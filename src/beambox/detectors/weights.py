@@ -68,7 +68,7 @@ def save_weights(
         "format": FORMAT,
         "detector": name_of(model),
         "config": json.dumps(config_to_dict(getattr(model, "config")), sort_keys=True),  # noqa: B009
-        "card": json.dumps(dict(card or {}), sort_keys=True),
+        "card": json.dumps(dict(card or {})),
     }
     write_bytes(Path(path), save(values, metadata=header), sync=True)
 

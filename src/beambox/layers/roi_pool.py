@@ -63,14 +63,18 @@ class _Gather(nn.Module):
         own = torch.cat((cells[:, :1], torch.div(cells[:, 1:], level.stride, rounding_mode="floor")), dim=1)
         found = voxel_query(points, own, sites, centres, level.reach, level.radius, level.samples)  # (M, S)
         none = found[:, :1] < 0
-        features = _normed(self.feature(cell_features.features.to(points.dtype)), self.feature_norm)  # (V, C)
+        features = _normed(
+            self.feature(cell_features.features.to(self.feature.weight.dtype)), self.feature_norm
+        )  # (V, C)
         row = found.clamp(min=0)
         if len(features) == 0:
             # the sum of no rows is zero and keeps every parameter in the graph, as processes in step need
             features, centres = features.sum(dim=0, keepdim=True), centres.new_zeros((1, 3))
         gathered = torch.where(none[..., None], 0.0, features[row])  # (M, S, C)
         away = torch.where(none[..., None], 0.0, centres[row] - points[:, None])  # (M, S, 3)
-        position = _normed(self.offset(away).flatten(0, 1), self.offset_norm).unflatten(0, found.shape)
+        position = _normed(self.offset(away.to(self.offset.weight.dtype)).flatten(0, 1), self.offset_norm).unflatten(
+            0, found.shape
+        )
         pooled = functional.relu((gathered + position).amax(dim=1))  # (M, C); ReLU and maximum commute
         return functional.relu(_normed(self.out(pooled), self.out_norm))
 
@@ -146,7 +150,8 @@ class RoiHead(nn.Module):
         shared = self.shared(pooled)  # (R, width)
         cls, box = self.cls_layers(shared), self.box_layers(shared)
         with torch.autocast(pooled.device.type, enabled=False):  # boxes to the millimetre: bfloat16 has three digits
-            return RoiPredictions(self.cls(cls.float())[:, 0], self.box(box.float()))
+            kind = self.cls.weight.dtype
+            return RoiPredictions(self.cls(cls.to(kind))[:, 0], self.box(box.to(kind)))
 
 
 def _connected(in_channels: int, width: int, dropout: float) -> nn.Sequential:

@@ -132,9 +132,10 @@ class KittiFiles:
         return len(task)
 
     def write_splits(self) -> None:
-        """List the frames that are whole; which of them are for validation depends on (seed, index) alone."""
+        """List the frames that are whole; of them the exact share is for validation, drawn by the seed."""
         names = sorted(p.stem for p in self._labels.glob("*.txt"))
-        val = {n for n in names if np.random.default_rng([self.seed, int(n), _VAL_SALT]).random() < self.val_share}
+        drawn = sorted(names, key=lambda n: np.random.default_rng([self.seed, int(n), _VAL_SALT]).random())
+        val = set(drawn[: round(self.val_share * len(names))])
         write_split(self.out, "train", [n for n in names if n not in val])
         write_split(self.out, "val", [n for n in names if n in val])
 

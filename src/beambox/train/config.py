@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -50,7 +51,9 @@ class DetectorSection(Section):
     options: dict[str, Any] = {}
     """Fields of the detector's config that differ from its defaults."""
     start_from: str | None = None
-    """Weights (.safetensors) to begin with instead of random ones; same detector, same shapes."""
+    """Weights to begin with instead of random ones, of the same detector: a shipped name, a .safetensors file or the
+    folder of a run. Options that the recipe leaves out are those of the weights; tensors whose shape differs begin
+    anew, and the log names them."""
 
 
 class SourceSection(Section):
@@ -274,7 +277,7 @@ def parse_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
 
 def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """Return ``values`` with changes given as ``a.b=value`` applied; new keys are checked later, by the schema."""
-    changed = yaml.safe_load(yaml.safe_dump(dict(values)))  # a deep copy of plain data
+    changed = copy.deepcopy(dict(values))
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not key:

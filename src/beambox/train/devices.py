@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from datetime import timedelta
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
 __all__ = ["choose_precision", "make_fabric"]
 
 FABRIC_PRECISION = {"float32": "32-true", "bfloat16": "bf16-mixed", "float16": "16-mixed"}
+
+PATIENCE = timedelta(hours=4)
+"""How long processes wait for each other: cutting objects out of a large data set is one process's work."""
 
 
 def choose_precision(wanted: str, device: str) -> str:
@@ -46,6 +50,7 @@ def make_fabric(precision: str) -> Fabric:
     """
     try:
         from lightning_fabric import Fabric
+        from lightning_fabric.strategies import DDPStrategy
     except ImportError:
         raise BeamboxError(f"training needs the package lightning-fabric: {how_to_install('train')}") from None
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -57,7 +62,7 @@ def make_fabric(precision: str) -> Fabric:
         accelerator=device,
         devices=local if many else 1,
         num_nodes=max(1, world // local) if many else 1,
-        strategy="ddp" if many else "auto",
+        strategy=DDPStrategy(timeout=PATIENCE) if many else "auto",
         precision=FABRIC_PRECISION[chosen],  # pyright: ignore[reportArgumentType]
     )
     fabric.launch()

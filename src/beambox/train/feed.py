@@ -153,6 +153,7 @@ def stream(feed: Feed, start: int, end: int, workers: int) -> Iterator[TrainingB
 
 
 def _quiet_worker(_: int) -> None:
-    """Leave Ctrl-C to the training process, which ends its workers itself."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Leave Ctrl-C, and a SIGTERM to the whole group, to the training process, which ends its workers itself."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     torch.set_num_threads(1)

@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -63,14 +63,15 @@ class RunLog:
         self.active, self.total, self.first = active, total, first
         self.started = time.perf_counter()
         self._console = Console(file=sys.stdout, soft_wrap=True, highlight=False)
-        self._file: IO[str] | None = None
+        self._file: IO[bytes] | None = None
+        self._lost = False
         self._board: Any = None
         self._bar: Progress | None = None
         self._heading: tuple[str, ...] = ()
         if not active:
             return
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = (folder / "log.jsonl").open("a", encoding="utf-8")
+        self._file = (folder / "log.jsonl").open("ab", buffering=0)  # nothing held back that a full disk could hurt
         if tensorboard:
             self._board = self._open_board(folder / "tensorboard", first)
         if self._console.is_terminal:
@@ -88,11 +89,17 @@ class RunLog:
         return SummaryWriter(str(folder), purge_step=first)
 
     def say(self, text: str) -> None:
-        """Print a line."""
-        if self.active:
+        """Print a line; a full disk behind the console is no reason to stop."""
+        if not self.active:
+            return
+        try:
             self._console.print(printable(text), markup=False)
             if not self._console.is_terminal:
                 sys.stdout.flush()
+        except BrokenPipeError:
+            raise
+        except OSError:
+            pass
 
     def progress(self, step: int) -> None:
         """Move the bar, where there is one."""
@@ -121,19 +128,23 @@ class RunLog:
         self.record(step, {**{f"loss/{name}": value for name, value in losses.items()}, "lr": lr, "s/step": seconds})
 
     def record(self, step: int, values: Mapping[str, float]) -> None:
-        """Write numbers to the files, without printing."""
-        if self._file is not None:
-            self._file.write(json.dumps({"step": step, **values}) + "\n")
-            self._file.flush()
-        if self._board is not None:
-            for name, value in values.items():
-                self._board.add_scalar(name, value, step)
+        """Write numbers to the files, without printing; where the disk is full they are lost, and training goes on."""
+        try:
+            if self._file is not None:
+                self._file.write((json.dumps({"step": step, **values}) + "\n").encode())
+            if self._board is not None:
+                for name, value in values.items():
+                    self._board.add_scalar(name, value, step)
+        except OSError as error:
+            if not self._lost:
+                self.say(f"warning: the log cannot be written ({error.strerror or error}); training goes on")
+            self._lost = True
 
     def close(self) -> None:
         """End the bar and close the files."""
         if self._bar is not None:
             self._bar.stop()
-        if self._board is not None:
-            self._board.close()
-        if self._file is not None:
-            self._file.close()
+        for each in (self._board, self._file):
+            with suppress(OSError):
+                if each is not None:
+                    each.close()

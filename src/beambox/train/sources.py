@@ -129,7 +129,8 @@ def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, sa
         return
     parts = []
     for section, source in object_sources(recipe, data):
-        say(f"cutting objects out of the {len(source)} frames of {section.path} {section.split}")
+        where = "the simulator" if section.kind == "simulated" else f"{folder_of(section, data)} {section.split}"
+        say(f"cutting objects out of the {len(source)} frames of {where}")
         parts.append(ObjectDatabase.build(source, tuple(recipe.augment.sample), recipe.augment.object_min_points))
     if not parts:
         raise BeamboxError("augment.sample needs objects: let at least one source of `data` have `objects: true`")

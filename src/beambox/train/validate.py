@@ -9,14 +9,13 @@ from typing import Any
 
 import torch
 
-from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.source import FrameSource
+from beambox.data.source import FrameSource, SubsetSource
 from beambox.infer.evaluate import detect_frames, network, score_frames, score_once, scored_frames
 from beambox.metrics.kitti import KittiFrame
 from beambox.metrics.kitti_result import KittiResult
-from beambox.metrics.once import SUPERCLASS_OF
 from beambox.metrics.once_result import OnceResult
 from beambox.train.config import ValidationSection
+from beambox.train.preflight import check_validation
 
 __all__ = ["Score", "Validator", "score_by", "summarise", "summarise_once"]
 
@@ -48,21 +47,33 @@ class Validator:
         """
         self.section, self.source, self.dtype = section, source, dtype
 
-    def __call__(self, model: Any) -> Score:
-        """Score a detector; its training mode is restored."""
+    def __call__(self, model: Any, rank: int = 0, processes: int = 1) -> Score:
+        """Score a detector; its training mode is restored.
+
+        Args:
+            model: to score.
+            rank: of this process, which detects in its share of the frames.
+            processes: that call this together and all get the score of all frames.
+        """
         section, classes = self.section, model.config.classes
-        merge = SUPERCLASS_OF if section.source.kind == "once" else {}
-        choices = [*dict.fromkeys(merge.get(name, name) for name in classes), "mean"]
-        if section.choose_by not in choices:
-            raise BeamboxError(
-                f'validation.choose_by: the detector has no class "{section.choose_by}"'
-                f"{did_you_mean(section.choose_by, choices)}"
-            )
-        result = score_by(section, scored_frames(detect_frames(network(model, self.dtype), self.source)), classes)
+        check_validation(section, classes)
+        mine = list(range(rank, len(self.source), processes))
+        share = SubsetSource(self.source, mine) if processes > 1 else self.source
+        frames = scored_frames(detect_frames(network(model, self.dtype), share))
+        result = score_by(section, gathered(frames, rank, processes), classes)
         score = summarise_once(result, section) if isinstance(result, OnceResult) else summarise(result, section)
         precision = str(self.dtype).removeprefix("torch.")
         table = {name: {**entry, "precision": precision} for name, entry in score.table.items()}
         return replace(score, text=f"{score.text} ({precision})", table=table)
+
+
+def gathered(frames: Sequence[KittiFrame], rank: int, processes: int) -> Sequence[KittiFrame]:
+    """Return the frames of all processes in the source's order, where frame i was given to process i % processes."""
+    if processes == 1:
+        return frames
+    shares: list[Sequence[KittiFrame]] = [[] for _ in range(processes)]
+    torch.distributed.all_gather_object(shares, frames)
+    return [shares[i % processes][i // processes] for i in range(sum(map(len, shares)))]
 
 
 def score_by(

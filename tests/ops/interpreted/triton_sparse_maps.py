@@ -1,4 +1,4 @@
-"""The Triton kernels of kernel maps and voxel queries, on a GPU or through Triton's interpreter (see test_triton.py)."""
+"""Triton kernels of kernel maps and voxel queries, on a GPU or through Triton's interpreter (see test_triton.py)."""
 
 import pytest
 import torch

@@ -114,7 +114,9 @@ def _parse(lines: dict[str, list[str]], body: bytes, path: Path) -> _Header:
         raise BeamboxError(f"{damaged} (line TYPE: expected {len(names)} letters, got {len(types)})")
     wrong = next((k for k, pair in enumerate(zip(types, sizes)) if pair not in NUMBERS), None)
     if wrong is not None:
-        raise BeamboxError(f"{damaged} (field {names[wrong]!a} has TYPE {types[wrong]!a} of {sizes[wrong]} bytes)")
+        raise BeamboxError(
+            f"{damaged} (field {names[wrong][:40]!a} has TYPE {types[wrong][:40]!a} of {sizes[wrong]} bytes)"
+        )
     if sum(counts) > 4096:
         raise BeamboxError(f"{damaged} (COUNT promises {sum(counts)} numbers a point, expected at most 4096)")
     draft = _Header(names, sizes, types, counts, 0, encoding)

@@ -49,7 +49,7 @@ def ball_counts(
 
 
 @triton.jit
-def _stack(
+def _stack(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     index, cells, column, z, voxels, size, low_b, low_z, low_y, low_x, height, width, pad_y, pad_x, block: tl.constexpr
 ):  # fmt: skip
     """Write each voxel's column and level, and set its bit: in any order, and twice does not matter."""

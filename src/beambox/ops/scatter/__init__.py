@@ -123,28 +123,36 @@ def scatter_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[in
     Raises:
         BeamboxError: if a shape or type does not fit, or, on the CPU, an index leaves the map.
     """
-    expect_shape("features", features, (None, None))
-    expect_shape("index", index, (len(features), 4))
-    expect_dtype("index", index, torch.int64)
-    ny, nx = size
-    if len(index) and not exporting() and not waiting_is_dear(index):  # a GPU would have to be waited for
-        low, high = index.amin(0).tolist(), index.amax(0).tolist()
-        if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
-            raise BeamboxError(
-                f"`index` (sample, z, y, x) must lie below ({batch_size}, any, {ny}, {nx}) and not below 0, "
-                f"got {tuple(low)} .. {tuple(high)}"
-            )
+    _check_bev(features, index, batch_size, size)
     return choose("scatter_bev", BEV_BACKENDS, features, index)(features, index, batch_size, size)
 
 
 def _check(values: Tensor, segment: Tensor, size: int) -> None:
+    if exporting():  # asking for a length would fix it in the graph
+        return
     expect_shape("values", values, (None, None))
     if not values.is_floating_point():
         raise BeamboxError(f"`values` must be floating point, got {str(values.dtype).removeprefix('torch.')}")
     expect_shape("segment", segment, (None,))
     expect_dtype("segment", segment, torch.int64)
     expect_same_length(values=len(values), segment=len(segment))
-    if len(segment) and not exporting() and not waiting_is_dear(segment):  # a GPU would have to be waited for
+    if len(segment) and not waiting_is_dear(segment):  # a GPU would have to be waited for
         low, high = (int(value) for value in segment.aminmax())
         if low < 0 or high >= size:
             raise BeamboxError(f"`segment` must lie in 0 .. {size - 1} (size {size}), got {low} .. {high}")
+
+
+def _check_bev(features: Tensor, index: Tensor, batch_size: int, size: tuple[int, int]) -> None:
+    if exporting():  # asking for a length would fix it in the graph
+        return
+    expect_shape("features", features, (None, None))
+    expect_shape("index", index, (len(features), 4))
+    expect_dtype("index", index, torch.int64)
+    ny, nx = size
+    if len(index) and not waiting_is_dear(index):  # a GPU would have to be waited for
+        low, high = index.amin(0).tolist(), index.amax(0).tolist()
+        if min(low) < 0 or high[0] >= batch_size or high[2] >= ny or high[3] >= nx:
+            raise BeamboxError(
+                f"`index` (sample, z, y, x) must lie below ({batch_size}, any, {ny}, {nx}) and not below 0, "
+                f"got {tuple(low)} .. {tuple(high)}"
+            )

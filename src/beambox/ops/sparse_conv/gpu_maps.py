@@ -64,7 +64,7 @@ def find_levels(source: Sites, geometries: Sequence[Geometry]) -> list[Sites]:
 
 
 @triton.jit
-def _look_up(
+def _look_up(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     keys, order, target_keys, target_order, table, rows, sources, steps, tz, ty, tx, nz, ny, nx, offsets, ky, kx,
     sz, sy, sx, pz, py, px, dz, dy, dx, block: tl.constexpr,
 ):  # fmt: skip
@@ -100,7 +100,7 @@ def _turn_round(forward, back, total, offsets, block: tl.constexpr):
 
 
 @triton.jit
-def _spread(
+def _spread(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     source, active, count, listed: tl.constexpr, nz, ny, nx, tz, ty, tx, kz, ky, kx, sz, sy, sx, pz, py, px, dz, dy, dx,
     block: tl.constexpr,
 ):  # fmt: skip

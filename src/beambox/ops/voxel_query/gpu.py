@@ -26,13 +26,14 @@ def voxel_query(
     limit = constant((radius,), points.device, points.dtype) ** 2  # rounded as the reference rounds
     _search[(triton.cdiv(len(points), BLOCK),)](
         points.contiguous(), cells.contiguous(), centres.contiguous(), sites.sorted_keys, sites.order, found, limit,
-        len(points), len(sites), len(sites).bit_length(), sites.batch_size, *sites.shape, *reach, samples, BLOCK, enable_fp_fusion=False,
+        len(points), len(sites), len(sites).bit_length(), sites.batch_size, *sites.shape, *reach, samples, BLOCK,
+        enable_fp_fusion=False,
     )  # fmt: skip
     return found
 
 
 @triton.jit
-def _search(
+def _search(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     points, cells, centres, keys, order, found, limit, count, sites, steps, nb, nz, ny, nx, rz, ry, rx, samples,
     block: tl.constexpr,
 ):  # fmt: skip

@@ -1,0 +1,89 @@
+"""From weights to a detector that trains: a fresh one, or one that takes over what fits of other weights."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from beambox.checks import BeamboxError
+from beambox.detectors.catalogue import build, tensors_since
+from beambox.detectors.renames import current_fields
+from beambox.detectors.weights import WeightFile, read_weights
+from beambox.infer.predictor import find_weights
+from beambox.train.config import DetectorSection
+
+__all__ = ["build_detector", "take_over"]
+
+SHOWN = 6
+
+
+def build_detector(section: DetectorSection, seed: int) -> tuple[nn.Module, list[str]]:
+    """Build a recipe's detector, from random weights or from those that it starts from.
+
+    Args:
+        section: of the recipe.
+        seed: of the random weights.
+
+    Returns:
+        The detector, and lines that say what came from where.
+
+    Raises:
+        BeamboxError: if there are no such weights, they are another detector's, or nothing of them fits.
+    """
+    if section.start_from is None:
+        return _fresh(section.name, section.options, seed), []
+    stored = read_weights(find_weights(section.start_from))
+    if stored.detector != section.name:
+        raise BeamboxError(
+            f"detector.start_from: {section.start_from} holds a {stored.detector}, the recipe trains a {section.name}"
+        )
+    detector = _fresh(section.name, _over(current_fields(stored.config), current_fields(section.options)), seed)
+    return detector, take_over(detector, stored, section.start_from)
+
+
+def _fresh(name: str, options: dict[str, Any], seed: int) -> nn.Module:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return build(name, options)
+
+
+def _over(base: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Lay a recipe's options over those of the weights, at any depth."""
+    joined = dict(base)
+    for key, value in options.items():
+        under = joined.get(key)
+        joined[key] = _over(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
+    return joined
+
+
+@torch.no_grad()
+def take_over(detector: nn.Module, stored: WeightFile, where: str) -> list[str]:
+    """Copy all tensors that fit by name and shape; returns lines that say so and name what did not.
+
+    Raises:
+        BeamboxError: if none fits.
+    """
+    own, theirs = detector.state_dict(), tensors_since(detector, stored.tensors)
+    fitting = [name for name in own if name in theirs and theirs[name].shape == own[name].shape]
+    weights = {name for name, _ in detector.named_parameters()}
+    if not weights & set(fitting):
+        raise BeamboxError(
+            f"detector.start_from: no tensor of {where} fits the recipe's detector, whose widths or cells differ; "
+            "leave these options out to take those of the weights, or start without them"
+        )
+    for name in fitting:
+        own[name].copy_(theirs[name])
+    lines = [f"started from {where}: {len(fitting)} of {len(own)} tensors"]
+    fresh = [name for name in own if name not in fitting]
+    if fresh:
+        told = [
+            f"{name} {tuple(theirs[name].shape)} -> {tuple(own[name].shape)}"
+            if name in theirs
+            else f"{name} (not in the weights)"
+            for name in fresh
+        ]
+        more = f" and {len(told) - SHOWN} more" if len(told) > SHOWN else ""
+        lines.append(f"  begun anew, as their shapes differ: {', '.join(told[:SHOWN])}{more}")
+    return lines

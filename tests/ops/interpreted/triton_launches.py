@@ -1,0 +1,103 @@
+"""What a pass of each detector gives a GPU to do, and where the host waits, counted on a CPU (see test_triton.py).
+
+The numbers do not depend on the size of a map or the number of points, so the networks keep their depth and look at a
+few square metres. Kernels whose values decide nothing are not run: a launch is counted, and that is all.
+"""
+
+import os
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+
+if os.environ.get("TRITON_INTERPRET") != "1":
+    pytest.skip("counts what the interpreter is given", allow_module_level=True)
+
+from torch.utils._python_dispatch import _disable_current_modes
+from triton.runtime import interpreter
+
+from beambox.detectors.catalogue import CATALOGUE, build
+from beambox.geometry.grid import VoxelGrid
+from beambox.infer.predictor import Detector
+from beambox.layers.roi import ProposalLimits
+from beambox.structures import Batch
+from beambox.train.config import read_recipe
+from oracles.launches import Launches
+
+DECIDE = ("_spread", "_take_apart", "_stack", "_walk")
+MOST = 400
+"""Operations and kernels of a pass, points to boxes."""
+READS = {
+    "pointpillars": (1, 1),
+    "second": (2, 1),
+    "voxel_rcnn": (2, 1),
+    "dennet": (2, 1),
+    "kassd": (2, 1),
+    "hcnet": (2, 1),
+}
+"""Times that the host waits: in the network and in decoding. Sizes are read after voxelization, and with sparse
+convolutions those of all levels together; HCNet asks for the number of pillars besides that of voxels."""
+
+
+@pytest.fixture
+def kernels(monkeypatch):
+    """Count launches; run only what decides sizes."""
+    counted = Counter()
+    run = interpreter.GridExecutor.__call__
+
+    def launch(self, *args, **kwargs):
+        counted[self.fn.__name__] += 1
+        if self.fn.__name__ in DECIDE:
+            with _disable_current_modes():
+                run(self, *args, **kwargs)
+
+    monkeypatch.setattr(interpreter.GridExecutor, "__call__", launch)
+    return counted
+
+
+def shrunk(name):
+    """The detector of the recipe for KITTI, all its layers, over 64 x 64 cells and with few proposals."""
+    recipe = read_recipe(f"{name}-kitti-3class")
+    config = build(recipe.detector.name, recipe.detector.options).config
+    (x, y, z), cell = config.grid.minimum, config.grid.cell
+    grid = VoxelGrid((x, -32 * cell[1], z), (x + 64 * cell[0], 32 * cell[1], config.grid.maximum[2]), cell)
+    changed = {"grid": grid, "post": replace(config.post, nms_pre=64, nms_post=20)}
+    if hasattr(config, "test_proposals"):
+        changed |= {"test_proposals": ProposalLimits(64, 6, 0.7), "lattice": 2}
+    if hasattr(config, "kam_options"):
+        changed["kam_options"] = replace(config.kam_options, test_boxes=64)
+    torch.manual_seed(0)
+    return CATALOGUE[name].build(replace(config, **changed)).eval()
+
+
+def sweeps(grid, size):
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.tensor(grid.minimum), torch.tensor(grid.maximum)
+    points = torch.rand((60 * size, 4), generator=generator)
+    points[:, :3] = low + points[:, :3] * (high - low)
+    return Batch(points, torch.arange(size).repeat_interleave(60), size)
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_a_pass_is_few_launches_and_hardly_waits(name, size, kernels):
+    detector = Detector(shrunk(name), device="cpu", precision="float32")
+    batch = sweeps(detector.grid, size)
+    with torch.inference_mode():
+        detector.model.decode(detector.predict(batch))  # what is made once is made now
+    kernels.clear()
+    with torch.inference_mode():
+        with Launches() as network:
+            predictions = detector.predict(batch)
+        with Launches() as decoding:
+            detector.model.decode(predictions)
+    told = f"network {network.operations}, decoding {decoding.operations}, kernels {kernels}"
+    total = sum(network.operations.values()) + sum(decoding.operations.values()) + sum(kernels.values())
+    print(f"\n{name:13} batch {size}: {sum(network.operations.values())} operations in the network, "
+          f"{sum(decoding.operations.values())} in decoding, {sum(kernels.values())} kernels; "
+          f"waits {dict(network.reads)} and {dict(decoding.reads)}")  # fmt: skip
+    assert total <= MOST, told
+    waits = (sum(network.reads.values()), sum(decoding.reads.values()))
+    assert waits == READS[name], (network.reads, decoding.reads)
+    assert not network.sent and not decoding.sent, (network.sent, decoding.sent)
