@@ -60,7 +60,7 @@ def shrunk(name):
     """The detector of the recipe for KITTI, all its layers, over 64 x 64 cells and with few proposals."""
     recipe = read_recipe(f"{name}-kitti-3class")
     config = build(recipe.detector.name, recipe.detector.options).config
-    (x, y, z), cell = config.grid.minimum, config.grid.cell
+    (x, _, z), cell = config.grid.minimum, config.grid.cell
     grid = VoxelGrid((x, -32 * cell[1], z), (x + 64 * cell[0], 32 * cell[1], config.grid.maximum[2]), cell)
     changed = {"grid": grid, "post": replace(config.post, nms_pre=64, nms_post=20)}
     if hasattr(config, "test_proposals"):
