@@ -24,8 +24,10 @@ MAY_IMPORT = {
     "visualise": {"structures", "geometry"},
     "infer": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "zoo"},
     "train": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "infer"},
+    "explain": {"infer", "detectors", "layers", "ops", "structures", "visualise", "geometry"},
     "report": {"infer", "data", "metrics", "visualise", "structures", "geometry", "ops"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
+    "stream": {"track", "infer", "data", "structures", "geometry"},
     "track": {"infer", "data", "metrics", "structures", "geometry", "ops"},
     "zoo": set(),
 }

@@ -59,6 +59,7 @@ def evaluate(  # noqa: PLR0913  # each is an option of the command too
     score_threshold: float = 0.0,
     results: str | Path | None = None,
     keep: str | Path | None = None,
+    report: str | Path | None = None,
     batch_size: int = 1,
     device: str | torch.device | None = None,
     precision: str = "auto",
@@ -79,6 +80,7 @@ def evaluate(  # noqa: PLR0913  # each is an option of the command too
         score_threshold: leave out detections below it.
         results: folder for KITTI's result files, one per frame.
         keep: file that keeps the detections, frame by frame; what it holds is not detected again.
+        report: page (.html) of curves, errors and the worst failures as pictures; ``beambox report`` can do more.
         batch_size: frames in one pass.
         device: "cpu", "cuda", ...; None takes the GPU where there is one.
         precision: "auto", "float32", "bfloat16" or "float16".
@@ -116,7 +118,14 @@ def evaluate(  # noqa: PLR0913  # each is an option of the command too
     wanted = list(classes) if classes else list(detector.classes)
     check_classes(wanted, iou, by_once)
     found = _found(detector, model, source, data, keep, batch_size, score_threshold)
-    frames = scored_frames(track(_written(found, results), len(source), "detecting", progress))
+    passing = _written(found, results)
+    if report is not None:
+        from beambox.report.build import after_evaluation
+
+        passing, write_report = after_evaluation(Path(report), passing, source, wanted, by_once, levels)
+    frames = scored_frames(track(passing, len(source), "detecting", progress))
+    if report is not None:
+        write_report(frames, model, detector, data, split)
     precision = str(detector.dtype).removeprefix("torch.")
     return evaluate_frames(frames, wanted, iou or ({},), by_once=by_once, levels=levels, precision=precision)
 

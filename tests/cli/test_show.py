@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from oracles.command_line import beambox
+from oracles.own_data import write_pandaset
 from oracles.tiny_detector import kitti_folder, street, tiny_weights
 
 Capture = pytest.CaptureFixture[str]
@@ -84,7 +85,8 @@ def test_show_turns_other_axes_forward_up(capsys: Capture, weights: Path, scan: 
     [
         (("--colour", "hight"), 'unknown colour "hight" (did you mean "height"?)'),
         (("--results", "nowhere"), "nowhere is not a folder of results"),
-        (("--out", "a.gif"), "a picture is written as .png, .jpg or .html"),
+        (("--out", "a.tif"), "a picture is written as .png, .jpg or .html, a film as .gif, .webp, .mp4"),
+        (("--out", "a.gif", "--rate", "0"), "--rate must be more than 0"),
         (("--labels", "there"), "they need the calibration of scan"),
         (("--area", "1,2"), "--area takes one number, or four"),
     ],
@@ -161,3 +163,37 @@ def test_demo_without_weights_says_what_to_do(capsys: Capture, monkeypatch: pyte
     monkeypatch.setattr("beambox.zoo.shipped", dict)
     ran = beambox(capsys, "demo")
     assert ran.status == 2 and "give them by --model" in ran.err
+
+
+def test_show_puts_several_sweeps_into_one_page_and_one_film(capsys: Capture, weights: Path, tmp_path: Path) -> None:
+    velodyne = kitti_folder(tmp_path / "kitti")
+    ran = beambox(capsys, "show", velodyne, "-m", weights, "--out", tmp_path / "a.html", "--rate", "4")
+    assert ran.status == 0 and "2 sweeps" in ran.out, ran.err
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert text.count('"intensity":') == 2 and '"score":0.3' in text and '"period":250' in text
+    film = beambox(capsys, "show", velodyne, "--out", tmp_path / "a.webp", "--rate", "4", "--area", "20")
+    assert film.status == 0, film.err
+    assert Image.open(tmp_path / "a.webp").n_frames == 2  # type: ignore[attr-defined]
+    one = beambox(capsys, "show", velodyne, "--frame", "000001", "--out", tmp_path / "one.png")
+    assert one.status == 0 and one.out.startswith("000001 ->")
+    none = beambox(capsys, "show", velodyne, "--frame", "000009", "--out", tmp_path / "none.png")
+    assert none.status == 2 and 'no sweep is called "000009"' in none.err
+
+
+def test_show_draws_a_data_set_of_ones_own_with_its_labels(capsys: Capture, weights: Path, tmp_path: Path) -> None:
+    described = write_pandaset(tmp_path / "own", frames=3)
+    ran = beambox(capsys, "show", described, "--frames", "2", "--out", tmp_path / "pictures", "--area", "45")
+    assert ran.status == 0, ran.err
+    assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == ["00.png", "01.png"]
+    options = ("--frame", "00", "--labels", "none", "--area", "45", "--out", tmp_path / "b.png")
+    bare = beambox(capsys, "show", described, *options)
+    assert bare.status == 0, bare.err
+    with_labels, without = (np.asarray(Image.open(p)) for p in (tmp_path / "pictures" / "00.png", tmp_path / "b.png"))
+    green = [(np.abs(each.astype(int) - (94, 234, 140)).sum(axis=-1) < 60).sum() for each in (with_labels, without)]
+    assert green[0] > green[1] + 300, "eight cars are outlined"
+    page = beambox(capsys, "show", described, "-m", weights, "--frame", "01", "--out", tmp_path / "p.html")
+    assert page.status == 0 and (tmp_path / "p.html").read_text(encoding="utf-8").count('"truth":true') == 8, page.err
+    wrong = beambox(capsys, "show", described, "--frame", "77", "--out", tmp_path / "c.png")
+    assert wrong.status == 2 and 'the data set has no frame "77"' in wrong.err
+    both = beambox(capsys, "show", described, tmp_path / "own" / "velodyne", "--out", tmp_path / "c.png")
+    assert both.status == 2 and "a data set is shown by itself" in both.err

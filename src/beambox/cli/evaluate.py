@@ -42,6 +42,9 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         Path | None,
         typer.Option(help="Keep detections in this file, frame by frame; what it holds is not detected again."),
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write a page (.html): curves, errors, the worst failures as pictures.")
+    ] = None,
     range_: RangeOption = "",
     view: ViewOption = "auto",
     published: Annotated[
@@ -74,6 +77,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         score_threshold=score_threshold,
         results=results,
         keep=keep,
+        report=report,
         batch_size=batch,
         device=device,
         precision=precision,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beambox.checks import BeamboxError
 from beambox.cli.options import DeviceOption, PrecisionOption, RangeOption, ViewOption, parse_range
 
 if TYPE_CHECKING:
@@ -54,11 +53,10 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     """
     from beambox.data.opening import open_data
     from beambox.data.source import SubsetSource
-    from beambox.report.build import Options, measured, write_page
+    from beambox.report.build import Options, check_page, measured, write_page
     from beambox.report.tables import check_ending
 
-    if out.suffix.lower() not in (".html", ".htm"):
-        raise BeamboxError(f"a report is a page, so its name ends in .html; got {out}")
+    check_page(out)
     for path in numbers or ():
         check_ending(path)
     source: FrameSource = open_data(data, split)

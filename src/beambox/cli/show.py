@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,19 +16,28 @@ from beambox.cli.console import progress, show_log
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+    from beambox.cli.show_inputs import Shown
     from beambox.geometry.axes import Axes
-    from beambox.infer.inputs import Sweep
     from beambox.infer.predictor import Detector
     from beambox.structures import Detections, Frame, Labels
     from beambox.visualise.bev import Region
+    from beambox.visualise.scene import Scene
 
 __all__ = ["command"]
 
 
 def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
-    inputs: options.InputsArgument,
+    inputs: Annotated[
+        list[str],
+        typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns, recordings; or a data set (YAML)."),
+    ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Picture (.png, .jpg) or page (.html); a folder for several.")
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Picture (.png, .jpg), 3-D page (.html) or film (.gif, .webp, .mp4); a folder for several pictures.",
+        ),
     ] = Path("show.png"),
     model: Annotated[str, typer.Option("--model", "-m", metavar="M", help="Detect with these weights.")] = "",
     results: Annotated[
@@ -36,6 +46,10 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     labels: Annotated[str, typer.Option(metavar="DIR", help="Ground truth in KITTI's format; none draws none.")] = "",
     colour: Annotated[str, typer.Option(help="Points by height or intensity.")] = "height",
     area: Annotated[str, typer.Option(metavar="A", help="What to show: 40 for 40 m all around, or x0,y0,x1,y1.")] = "",
+    split: Annotated[str, typer.Option(help="Of a data set: the list of frames; all of them where not given.")] = "",
+    frame: Annotated[str, typer.Option(metavar="NAMES", help="Only the sweeps of these names, as 000001,000004.")] = "",
+    frames: Annotated[int, typer.Option(min=0, help="Only the first so many sweeps; 0: all.")] = 0,
+    rate: Annotated[float, typer.Option(help="Sweeps per second of films and of a page's time line.")] = 5.0,
     min_score: options.MinScoreOption = 0.3,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
@@ -53,55 +67,83 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
       beambox show scan.bin --model pointpillars-sim --out scan.png
       beambox show kitti/training/velodyne/000008.bin --out truth.png
       beambox show kitti/training/velodyne --results results --out pictures
-      beambox show scan.bin --model pointpillars-sim --out scan.html
+      beambox show drive --model pointpillars-sim --out drive.html
+      beambox show drive --model pointpillars-sim --out drive.webp --rate 10
+      beambox show data.yaml --frames 20 --out pictures
 
-    Labels and camera image are found beside a sweep in KITTI's layout (../label_2, ../image_2). A page (.html) shows
-    points and boxes in three dimensions in any browser, and needs no other file.
+    Labels and camera image are found beside a sweep in KITTI's layout (../label_2, ../image_2); a data set described by
+    a YAML file brings its own labels. A page (.html) shows points and boxes in three dimensions in any browser, several
+    sweeps with a time line, and needs no other file.
     """
     from beambox.data.existence import expect_inputs
 
     check_choices(colour, model, results)
+    check_rate(rate)
     expect_inputs(inputs)
 
+    from beambox.cli import show_inputs
     from beambox.geometry.axes import Axes
-    from beambox.infer.inputs import find_sweeps, read_sweep
-    from beambox.infer.predictor import load
-    from beambox.io import write_text
-    from beambox.visualise.canvas import save_picture
-    from beambox.visualise.viewer import viewer_html
 
     show_log()
     turned = Axes.parse(axes) if axes else Axes()
     shown = region_of_option(area)
-    sweeps = find_sweeps(inputs)
-    detector = None
-    if model:
-        detector = load(
-            model,
-            device=device,
-            precision=precision,
-            range=options.parse_range(range_),
-            view=view,  # pyright: ignore[reportArgumentType]  # load checks it
-            sensor_height=sensor_height,
-            axes=turned,
-            ground_slope=options.parse_slope(ground_slope),
-            intensity_scale=intensity_scale,
-            fields=fields or None,
-        )
+    source = show_inputs.data_set_of(inputs, split)
+    sweeps = show_inputs.sweeps_of(
+        inputs, source, frame, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
+    )
     paths = picture_paths(sweeps, out)
-    for sweep, path in progress(zip(sweeps, paths), len(sweeps), "Drawing"):
-        frame = read_sweep(sweep, fields=fields or None, intensity_scale=intensity_scale, labels=not labels)
-        truth = truth_of(frame, labels)
-        detections = found_in(frame, detector, results)
-        if detections is not None:
-            detections = detections.above(min_score)
-        frame = frame if detector is None else detector.crop(frame)
-        frame, detections, truth = forward_up(frame, detections, truth, turned)
-        if path.suffix == ".html":
-            write_text(path, viewer_html(frame, detections, truth))
-        else:
-            save_picture(picture_of(frame, detections, truth, detector, shown, colour), path)
-        print(f"{sweep.name} -> {path}")
+    detector = show_inputs.detector_for(
+        model,
+        source,
+        device=device,
+        precision=precision,
+        range=options.parse_range(range_),
+        view=view,
+        sensor_height=sensor_height,
+        axes=turned,
+        ground_slope=options.parse_slope(ground_slope),
+        intensity_scale=intensity_scale,
+        fields=fields or None,
+    )
+
+    def scenes() -> Iterator[Scene]:
+        for sweep in progress(sweeps, len(sweeps), "Drawing"):
+            yield scene_of(sweep.read(), detector, results, labels, turned)
+
+    write_all(out, paths, sweeps, scenes(), detector, shown, colour, min_score, rate)
+
+
+FILMS = (".gif", ".webp", ".mp4")
+
+
+def scene_of(frame: Frame, detector: Detector | None, results: Path | None, labels: str, axes: Axes) -> Scene:
+    """Return what is known of a sweep, forward up."""
+    from beambox.visualise.scene import Scene
+
+    truth = truth_of(frame, labels)
+    detections = found_in(frame, detector, results)
+    frame = frame if detector is None else detector.crop(frame)
+    return Scene(*forward_up(frame, detections, truth, axes))
+
+
+def write_all(
+    out: Path,
+    paths: Sequence[Path],
+    sweeps: Sequence[Shown],
+    scenes: Iterator[Scene],
+    detector: Detector | None,
+    shown: Region | None,
+    colour: str,
+    min_score: float,
+    rate: float,
+) -> None:
+    """Write the page, the film or the pictures."""
+    if out.suffix.lower() == ".html":
+        write_scenes(out, scenes, min_score, rate)
+    elif out.suffix.lower() in FILMS:
+        write_film(out, film_pictures(scenes, detector, shown, colour, min_score), rate)
+    else:
+        write_pictures(paths, sweeps, (picture_of(one, detector, shown, colour, min_score) for one in scenes))
 
 
 def check_choices(colour: str, model: str, results: Path | None) -> None:
@@ -124,15 +166,72 @@ def region_of_option(area: str) -> Region | None:
     return Region(*numbers) if isinstance(numbers, list) else Region(-numbers, -numbers, numbers, numbers)
 
 
-def picture_paths(sweeps: list[Sweep], out: Path) -> list[Path]:
-    """Return where each picture goes: the named file for one sweep, files in the named folder for several."""
-    if out.suffix and out.suffix.lower() not in (".png", ".jpg", ".jpeg", ".html"):
-        raise BeamboxError(f"a picture is written as .png, .jpg or .html, got the name {out}")
-    if len(sweeps) == 1 and out.suffix:
+def picture_paths(sweeps: Sequence[Shown], out: Path) -> list[Path]:
+    """Return where each picture goes: the named file for one sweep, files in the named folder for several.
+
+    Raises:
+        BeamboxError: if the name's ending says no known form, or one picture is to hold several sweeps.
+    """
+    from beambox.visualise.video import can_write
+
+    ending = out.suffix.lower()
+    if ending in FILMS:
+        can_write(out)
+        return []
+    if ending == ".html":
+        return []
+    if ending not in ("", ".png", ".jpg", ".jpeg"):
+        raise BeamboxError(
+            f"a picture is written as .png, .jpg or .html, a film as {', '.join(FILMS)}; got the name {out}"
+        )
+    if len(sweeps) == 1 and ending:
         return [out]
-    if out.suffix:
+    if ending:
         raise BeamboxError(f"{len(sweeps)} sweeps make {len(sweeps)} pictures; give --out a folder, got {out}")
     return [out / f"{sweep.name}.png" for sweep in sweeps]
+
+
+def write_scenes(out: Path, scenes: Iterable[Scene], min_score: float, rate: float) -> None:
+    """Write all sweeps into one 3-D page."""
+    from beambox.io import write_text
+    from beambox.visualise.scene import scene_html
+
+    some = list(scenes)
+    write_text(out, scene_html(some, min_score=min_score, period=1 / rate))
+    print(f"{some[0].frame.id if len(some) == 1 else f'{len(some)} sweeps'} -> {out}")
+
+
+def write_film(out: Path, pictures: Iterable[Image], rate: float) -> None:
+    """Write all sweeps into one film."""
+    from beambox.visualise.video import write_video
+
+    print(f"{write_video(out, pictures, rate)} sweeps -> {out}")
+
+
+def write_pictures(paths: Sequence[Path], sweeps: Sequence[Shown], pictures: Iterable[Image]) -> None:
+    """Write a picture per sweep."""
+    from beambox.visualise.canvas import save_picture
+
+    for path, sweep, picture in zip(paths, sweeps, pictures):
+        save_picture(picture, path)
+        print(f"{sweep.name} -> {path}")
+
+
+def check_rate(rate: float) -> None:
+    """Refuse a rate that no film has."""
+    if not 0 < rate <= 100:
+        raise BeamboxError(f"--rate must be more than 0 and at most 100 sweeps per second, got {rate:g}")
+
+
+def film_pictures(
+    scenes: Iterable[Scene], detector: Detector | None, shown: Region | None, colour: str, min_score: float
+) -> Iterator[Image]:
+    """Draw the sweeps of a film: all show the same metres around the sensor, which the first sweep chooses."""
+    from beambox.visualise.bev import region_of
+
+    for scene in scenes:
+        shown = shown or region_of(scene.frame, None if scene.labels is None else scene.labels.boxes)
+        yield picture_of(scene, detector, shown, colour, min_score)
 
 
 def truth_of(frame: Frame, labels: str) -> Labels | None:
@@ -181,14 +280,7 @@ def forward_up(
     )
 
 
-def picture_of(
-    frame: Frame,
-    detections: Detections | None,
-    truth: Labels | None,
-    detector: Detector | None,
-    shown: Region | None,
-    colour: str,
-) -> Image:
+def picture_of(scene: Scene, detector: Detector | None, shown: Region | None, colour: str, min_score: float) -> Image:
     """Draw, with the detector's region where there is one."""
     from beambox.visualise.bev import Region
     from beambox.visualise.picture import draw_sweep
@@ -197,10 +289,13 @@ def picture_of(
     if detector is not None:
         (x0, y0, _), (x1, y1, _) = detector.grid.minimum, detector.grid.maximum
         looked_at = Region(x0, y0, x1, y1)
+    detections = scene.detections
+    if detections is not None:
+        detections = detections.above(min_score)
     return draw_sweep(
-        frame,
+        scene.frame,
         detections,
-        truth,
+        scene.labels,
         region=shown,
         looked_at=looked_at,
         colour_by="height" if colour == "height" else "intensity",

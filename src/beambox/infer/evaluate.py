@@ -30,6 +30,7 @@ __all__ = [
     "check_classes",
     "detect_frames",
     "evaluate_frames",
+    "merged_classes",
     "network",
     "parse_overlaps",
     "score_frames",
@@ -221,7 +222,7 @@ def evaluate_frames(
     results = score_rounds(score, classes, rounds)
     if not by_once:
         return Evaluation(results, box_errors(frames, classes), precision)
-    merged = [_merged(frame) for frame in frames]
+    merged = [merged_classes(frame) for frame in frames]
     names = list(dict.fromkeys(once.SUPERCLASS_OF.get(name, name) for name in classes))
     return Evaluation(results, box_errors(merged, names), precision)
 
@@ -246,7 +247,7 @@ def check_classes(classes: Sequence[str], rounds: Sequence[Mapping[str, float]],
             score_frames([nothing], wanted, overlaps, levels=False)
 
 
-def _merged(frame: KittiFrame) -> KittiFrame:
+def merged_classes(frame: KittiFrame) -> KittiFrame:
     """Name objects and detections by ONCE's merged classes."""
     merge, labels, found = once.SUPERCLASS_OF, frame.labels, frame.detections
     named = replace(labels, names=tuple(merge.get(name, name) for name in labels.names))

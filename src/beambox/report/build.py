@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,28 @@ from beambox.data.source import FrameSource
 from beambox.infer.benchmark import device_name
 from beambox.infer.cards import read_card
 from beambox.infer.evaluate import detect_frames, scored_frames
-from beambox.infer.predictor import View, find_weights, load
+from beambox.infer.predictor import Detector, View, find_weights, load
 from beambox.infer.results import find_result, read_result
 from beambox.io import read_text, write_text
+from beambox.metrics.kitti import KittiFrame
+from beambox.progress import track
 from beambox.report.failures import Picture, draw_failures, worst
 from beambox.report.measure import Measured, PointCounts, TimedDetect, measure
 from beambox.report.page import report_html
 from beambox.report.tables import write_numbers
 from beambox.structures import Detections, Frame
 
-__all__ = ["Options", "base_source", "is_results", "measured", "write_page"]
+__all__ = [
+    "Options",
+    "about_data",
+    "about_weights",
+    "after_evaluation",
+    "base_source",
+    "check_page",
+    "is_results",
+    "measured",
+    "write_page",
+]
 
 RECIPE_NAMES = ("recipe.yaml", "config.yaml")
 """What a run's folder calls the recipe it was trained by."""
@@ -71,21 +83,16 @@ def measured(given: str, source: FrameSource, options: Options) -> Measured:
         BeamboxError: if there are no such weights or results, or the data have no labels.
     """
     counts = PointCounts()
-    about: dict[str, Any] = {
-        "data": options.data.name,
-        "split": options.split,
-        "beambox": __version__,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
+    about = about_data(options.data, options.split)
     if is_results(given):
         found = _read_results(Path(given), source)
-        frames = scored_frames(counts.watch(found))
+        frames = scored_frames(track(counts.watch(found), len(source), "reading"))
         known = dict.fromkeys(name for frame in frames for name in frame.detections.classes)
         classes, about = tuple(known), {"results": Path(given).name, **about}
     else:
         detect, classes, more = _detector(given, source, options)
-        frames = scored_frames(counts.watch(detect_frames(detect, source, batch=options.batch)))
+        found = detect_frames(detect, source, batch=options.batch)
+        frames = scored_frames(track(counts.watch(found), len(source), "detecting"))
         about = {**more, **about}
         if detect.summary():
             about["latency, ms per frame"] = detect.summary()
@@ -113,20 +120,35 @@ def _detector(given: str, source: FrameSource, options: Options) -> tuple[TimedD
     detector = load(
         given, device=options.device, precision=options.precision, view=view, range=region, sensor_height=height
     )
-    path = find_weights(given)
+    about = {**about_weights(find_weights(given), detector), "frames in one pass": options.batch}
+    return TimedDetect(detector.detect), tuple(detector.classes), about
+
+
+def about_weights(path: Path, detector: Detector) -> dict[str, Any]:
+    """Return what is known of a detector: its weights, where it runs, its card, the recipe beside it."""
     card = read_card(path)
     about: dict[str, Any] = {
         "detector": card.detector,
         "weights": f"{path.name}, sha256 {card.sha256}",
         "device": device_name(detector.device),
         "precision": str(detector.dtype).removeprefix("torch."),
-        "frames in one pass": options.batch,
         "card": dict(card.said),
     }
     recipe = next((path.parent / name for name in RECIPE_NAMES if (path.parent / name).is_file()), None)
     if recipe is not None:
         about["recipe"] = {recipe.name: read_text(recipe)}
-    return TimedDetect(detector.detect), tuple(detector.classes), about
+    return about
+
+
+def about_data(data: Path | str, split: str) -> dict[str, Any]:
+    """Return what was looked at, and with which versions."""
+    return {
+        "data": Path(data).name,
+        "split": split,
+        "beambox": __version__,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
 
 
 def _read_results(folder: Path, source: FrameSource) -> Iterator[tuple[Frame, Detections]]:
@@ -142,6 +164,47 @@ def _read_results(folder: Path, source: FrameSource) -> Iterator[tuple[Frame, De
         assert path is not None
         frame = source[index]
         yield frame, read_result(path, frame)
+
+
+def after_evaluation(
+    out: Path,
+    found: Iterator[tuple[Frame, Detections]],
+    source: FrameSource,
+    classes: Sequence[str],
+    by_once: bool,
+    levels: bool,
+) -> tuple[Iterator[tuple[Frame, Detections]], Callable[..., None]]:
+    """Return detections to hand on, and what writes the report once they have all passed by.
+
+    Args:
+        out: the page.
+        found: frames and their detections.
+        source: of the frames.
+        classes: to score.
+        by_once: by ONCE's rules.
+        levels: False: without KITTI's levels.
+
+    Raises:
+        BeamboxError: if the page's name does not end in .html.
+    """
+    check_page(out)
+    counts = PointCounts()
+
+    def write(frames: Sequence[KittiFrame], model: Any, detector: Detector, data: Any, split: str) -> None:
+        named = isinstance(model, str | Path)
+        about = about_weights(find_weights(model), detector) if named else {}
+        about |= about_data(data if isinstance(data, str | Path) else "", split)
+        name = Path(model).stem if named else "detector"
+        one = measure(name, frames, classes, by_once=by_once, levels=levels, points=counts.counts, about=about)
+        write_page(out, [one], source)
+
+    return counts.watch(found), write
+
+
+def check_page(out: Path) -> None:
+    """Refuse a name that is no page's, before anything is measured."""
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise BeamboxError(f"a report is a page, so its name ends in .html; got {out}")
 
 
 def write_page(
@@ -164,7 +227,8 @@ def write_page(
     """
     first = all_of[0]
     failures = {name: worst(first.matches, name, most) for name in first.classes}
-    drawn = list(draw_failures(first, source, [one for some in failures.values() for one in some]))
+    some_of_all = [one for some in failures.values() for one in some]
+    drawn = list(track(draw_failures(first, source, some_of_all), len(some_of_all), "drawing"))
     pictures: dict[str, list[Picture]] = {name: [] for name in first.classes}
     for picture in drawn:
         pictures[picture.failure.name].append(picture)

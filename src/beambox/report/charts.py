@@ -23,7 +23,7 @@ STYLES = ("-", "--", ":")
 def _figure(width: float = 4.6, height: float = 3.4) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="tight")
     return figure, figure.add_subplot()
 
 
@@ -46,8 +46,6 @@ def curves_chart(all_of: Sequence[Measured], name: str) -> bytes:
     """Draw the precision-recall curves of a class: the official interpolation at 41 recalls, else at every recall."""
     figure, axes = _figure()
     for one, colour in zip(all_of, COLOURS):
-        if name not in one.classes:
-            continue
         if isinstance(one.scored, KittiResult):
             recalls = np.linspace(0, 1, 41)
             for level, average, style in zip(one.scored.levels, one.scored[name].box3d, STYLES):

@@ -27,8 +27,8 @@ Integers = NDArray[np.int64]
 KINDS = ("right", "ignored", "duplicate", "misplaced", "wrong class", "background")
 """What a detection is: right; one of nothing that counts; a second one of an object; of an object, but elsewhere; of an
 object of another class; of nothing that is labelled."""
-NEAR_OVERLAP = 0.1
-"""BEV IoU from which a detection is about an object, though it does not match it."""
+NEAR_SHARE = 0.2
+"""Share of the smaller of two boxes, in BEV, that both cover, from which a detection is about an object."""
 SPARED_SHARE = 0.5
 """Share of a detection's image box in an unlabelled region from which it is ignored."""
 
@@ -71,7 +71,7 @@ class Found(NamedTuple):
     iou: Floats
     """Largest 3-D IoU with an object of its class."""
     about: NDArray[np.str_]
-    """Class of the object of largest BEV IoU, whatever its class; empty below ``NEAR_OVERLAP``."""
+    """Class of the object it covers most of, whatever its class; empty below ``NEAR_SHARE``."""
 
 
 TRUTH_TYPES = (np.int64, np.int64, np.str_, np.bool_, np.float64, np.int64, np.int64, np.float64)
@@ -124,6 +124,10 @@ def _match_frame(
     labels, found = frame.labels, frame.detections
     truth, boxes = labels.boxes.double().numpy(), found.boxes.detach().cpu().double().numpy()
     bev, box3d = rotated_overlaps(truth, boxes)  # (N, M) each
+    area, areas = truth[:, 3] * truth[:, 4], boxes[:, 3] * boxes[:, 4]
+    shared = bev * (area[:, None] + areas) / (1 + bev)  # from the IoU back to square metres
+    smaller = np.minimum(area[:, None], areas)
+    near = np.divide(shared, smaller, out=np.zeros_like(bev), where=smaller > 0)
     counts, spared = countable(labels), _spared(frame)
     truth_names, found_names = (
         np.array([n.lower() for n in names], dtype=np.str_) for names in (labels.names, found.names)
@@ -133,7 +137,7 @@ def _match_frame(
     for key, name in known.items():
         rows, columns = np.flatnonzero(truth_names == key), np.flatnonzero(found_names == key)
         columns = columns[np.argsort(-scores[columns], kind="stable")]
-        own3d, own_bev = box3d[np.ix_(rows, columns)], bev[np.ix_(rows, columns)]
+        own3d, own_near = box3d[np.ix_(rows, columns)], near[np.ix_(rows, columns)]
         neighbours = np.flatnonzero(truth_names == NEIGHBOUR.get(key, ""))
         others = np.flatnonzero((truth_names != key) & (truth_names != NEIGHBOUR.get(key, "")))
         partner = {column: row for row, column in greedy_pairs(own3d, thresholds[name])}
@@ -146,9 +150,9 @@ def _match_frame(
                 kinds[column] = "ignored"
             elif (own3d[:, place] > thresholds[name]).any():
                 kinds[column] = "duplicate"
-            elif (own_bev[:, place] > NEAR_OVERLAP).any():
+            elif (own_near[:, place] > NEAR_SHARE).any():
                 kinds[column] = "misplaced"
-            elif (bev[others, column] > NEAR_OVERLAP).any():
+            elif (near[others, column] > NEAR_SHARE).any():
                 kinds[column] = "wrong class"
     distance = [np.hypot(each[:, 0], each[:, 1]) for each in (truth, boxes)]
     occlusion = np.full(len(truth), -1) if labels.attributes is None else labels.attributes.occlusion.long().numpy()
@@ -159,8 +163,8 @@ def _match_frame(
     for column, key in enumerate(found_names):
         if key in known:
             mine = box3d[truth_names == key, column]
-            near = int(bev[:, column].argmax()) if len(truth) else 0
-            about = str(labels.names[near]) if len(truth) and bev[near, column] > NEAR_OVERLAP else ""
+            nearest = int(near[:, column].argmax()) if len(truth) else 0
+            about = str(labels.names[nearest]) if len(truth) and near[nearest, column] > NEAR_SHARE else ""
             founds.append(
                 (number, column, known[key], scores[column], distance[1][column], kinds[column],
                  mine.max(initial=0.0), known.get(about.lower(), about))

@@ -6,18 +6,17 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beambox.infer.evaluate import score_frames, score_once
+from beambox.infer.evaluate import merged_classes, score_frames, score_once
 from beambox.metrics.box_errors import box_errors
 from beambox.metrics.box_errors_result import BoxErrors
 from beambox.metrics.kitti import KittiFrame
 from beambox.metrics.kitti_result import KittiResult
-from beambox.metrics.once import SUPERCLASS_OF
 from beambox.metrics.once_result import OnceResult
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.report import numbers
@@ -84,21 +83,13 @@ def measure(
     """
     if by_once:
         scored: KittiResult | OnceResult = score_once(frames, known=classes)
-        frames = [_merged(frame) for frame in frames]
+        frames = [merged_classes(frame) for frame in frames]
         thresholds = dict(zip(scored.classes, scored.iou))  # pyright: ignore[reportAttributeAccessIssue]
     else:
         scored = score_frames(frames, classes, levels=levels)
         thresholds = {each.name: each.iou for each in scored.classes}
     matches = match_frames(frames, thresholds, points)
     return Measured(name, frames, scored, box_errors(frames, list(thresholds)), matches, about or {})
-
-
-def _merged(frame: KittiFrame) -> KittiFrame:
-    """Name objects and detections by ONCE's merged classes."""
-    labels, found = frame.labels, frame.detections
-    named = replace(labels, names=tuple(SUPERCLASS_OF.get(name, name) for name in labels.names))
-    classes = tuple(SUPERCLASS_OF.get(name, name) for name in found.classes)
-    return frame._replace(labels=named, detections=replace(found, classes=classes))
 
 
 class PointCounts:

@@ -1,4 +1,4 @@
-"""AP by distance, occlusion and number of points; calibration of scores; confusion of classes; the best working point."""
+"""AP by distance, occlusion and number of points; calibration of scores; confusion of classes; working points."""
 
 from __future__ import annotations
 

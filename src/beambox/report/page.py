@@ -43,7 +43,8 @@ def report_html(
     for each in first.classes:
         shown = (pictures or {}).get(each, ())
         parts.append(f'<section data-class="{escape(each)}">')
-        parts += [*_class(all_of, each), *_pictures(shown, links or {}), "</section>"]
+        parts += [*_class([one for one in all_of if each in one.classes], each), *_pictures(shown, links or {})]
+        parts.append("</section>")
     parts += [_confusion(all_of), *(_about(one) for one in all_of)]
     page = Path(__file__).with_name("report.html").read_text(encoding="utf-8")
     return fill(page, {"TITLE": escape(name), "CONTENT": "\n".join(parts)})
@@ -94,7 +95,7 @@ def _scores(all_of: Sequence[Measured]) -> str:
     kitti = isinstance(first.scored, KittiResult)
     notes = first.scored.table().splitlines()[: 3 if kitti else 2]
     parts = ["<h2>Average precision</h2><p>", "<br>".join(escape(line) for line in notes), "</p>"]
-    if not kitti or len(first.scored.levels) > 1:
+    if not isinstance(first.scored, KittiResult) or len(first.scored.levels) > 1:
         parts.append("<p>On grey, in bold: the number that papers quote.</p>")
     if kitti and _capped(first):
         parts.append(f"<p>{escape(_capped(first))}</p>")

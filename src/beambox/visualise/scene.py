@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, printable
 from beambox.structures import Detections, Frame, Labels
 from beambox.visualise.colours import TRUTH, class_colour, gradient
 from beambox.visualise.image import open_image
@@ -97,7 +97,7 @@ def scene_html(
         "score": min_score,
         "period": round(1000 * period),
     }
-    name = html.escape(title or scenes[0].frame.id or "sweep")
+    name = html.escape(printable(title or scenes[0].frame.id or "sweep", 500))
     parts = {"TITLE": name, "DATA": script_json(content), "THREE": three, "SCRIPT": script}
     return fill(template("scene.html"), parts)
 
@@ -118,7 +118,7 @@ def _clouds(scenes: Sequence[Scene], room: int) -> list[dict[str, Any]]:
         size = sum(len(cloud["xyz"]) + len(cloud["intensity"]) for cloud in clouds)
         if size <= room or share < 0.001:
             return clouds
-        share *= min(0.9, 0.97 * max(room, 1) / size)
+        share *= min(0.97, 0.97 * max(room, 1) / size)
     return clouds
 
 
@@ -146,7 +146,7 @@ def _cloud(points: torch.Tensor, share: float) -> dict[str, Any]:
 
 
 def _packed(array: NDArray[np.uint8]) -> str:
-    return base64.b64encode(zlib.compress(array.tobytes(), 9)).decode("ascii")
+    return base64.b64encode(zlib.compress(array.tobytes(), 6)).decode("ascii")
 
 
 def _shade(values: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -92,7 +92,8 @@ def _same_size(pictures: Iterable[Image.Image]) -> Iterator[Image.Image]:
     for picture in pictures:
         if size is None:
             shrink = min(1.0, LARGEST / max(picture.size))
-            size = tuple(max(2, round(edge * shrink) // 2 * 2) for edge in picture.size)  # even, as mp4 wants
+            width, height = (max(2, round(edge * shrink) // 2 * 2) for edge in picture.size)  # even, as mp4 wants
+            size = (width, height)
         scale = min(size[0] / picture.width, size[1] / picture.height)
         fitted = picture.convert("RGB").resize((round(picture.width * scale), round(picture.height * scale)))
         frame = Image.new("RGB", size)

@@ -82,6 +82,7 @@ __all__ = [
     "Neck",
     "kassd",
     "location_attention",
+    "location_weights",
 ]
 
 
@@ -444,11 +445,15 @@ def location_attention(high: Tensor, low: Tensor, reduce: LamReduce | str = LamR
         ``(B, C, Y, X)``.
     """
     reduce = chosen("reduce", reduce, LamReduce)
+    return low + location_weights(high, low, reduce) * (high - low)
+
+
+def location_weights(high: Tensor, low: Tensor, reduce: LamReduce = LamReduce.SUM) -> Tensor:
+    """Return the weight of the higher level at every place, ``(B, 1, Y, X)``; see :func:`location_attention`."""
     difference = (high - low).sum(dim=1, keepdim=True, dtype=torch.promote_types(high.dtype, torch.float32))
     if reduce is LamReduce.MEAN:
         difference = difference / high.shape[1]
-    weight = torch.sigmoid(difference).to(high.dtype)  # (B, 1, Y, X), the softmax of a pair
-    return low + weight * (high - low)
+    return torch.sigmoid(difference).to(high.dtype)  # the softmax of a pair
 
 
 class FeatureReuse(nn.Module):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from beambox.ops.neighborhood.windows import window_start
 
-__all__ = ["neighborhood_attention"]
+__all__ = ["neighborhood_attention", "neighborhood_weights"]
 
 
 def neighborhood_attention(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, window: int = 7) -> Tensor:
@@ -15,15 +15,25 @@ def neighborhood_attention(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, window
 
     ``softmax(q . k / sqrt(d) + bias) . v`` over the pixels of the window.
     """
-    height, width, depth = q.shape[2:]
-    rows = window_start(height, window, q.device)[:, None] + torch.arange(window, device=q.device)  # (H, L)
-    columns = window_start(width, window, q.device)[:, None] + torch.arange(window, device=q.device)  # (W, L)
-    above = rows - torch.arange(height, device=q.device)[:, None] + window - 1  # (H, L) rows of the bias table
-    beside = columns - torch.arange(width, device=q.device)[:, None] + window - 1  # (W, L)
+    weights = neighborhood_weights(q, k, bias, window)
+    seen = v[(..., *_windows(q.shape[2], q.shape[3], window, q.device), slice(None))]  # (B, heads, H, W, k, k, d)
+    return (weights[..., None] * seen).sum(dim=(4, 5))
 
-    at = (rows[:, None, :, None], columns[None, :, None, :])  # (H, W, L, L)
-    near_k, near_v = k[(..., *at, slice(None))], v[(..., *at, slice(None))]  # (B, heads, H, W, L, L, d)
-    logits = (q[:, :, :, :, None, None] * near_k).sum(dim=6) / depth**0.5  # (B, heads, H, W, L, L)
+
+def neighborhood_weights(q: Tensor, k: Tensor, bias: Tensor, window: int = 7) -> Tensor:
+    """Return how much each pixel attends to each of its window: ``(B, heads, H, W, window, window)``, sums of 1."""
+    height, width, depth = q.shape[2:]
+    at = _windows(height, width, window, q.device)
+    above = at[0][:, 0, :, 0] - torch.arange(height, device=q.device)[:, None] + window - 1  # (H, L) rows of the bias
+    beside = at[1][0, :, 0, :] - torch.arange(width, device=q.device)[:, None] + window - 1  # (W, L)
+    near = k[(..., *at, slice(None))]  # (B, heads, H, W, L, L, d)
+    logits = (q[:, :, :, :, None, None] * near).sum(dim=6) / depth**0.5  # (B, heads, H, W, L, L)
     logits = logits + bias[:, above[:, None, :, None], beside[None, :, None, :]]
-    weights = logits.flatten(4).softmax(dim=4).view_as(logits)
-    return (weights[..., None] * near_v).sum(dim=(4, 5))  # (B, heads, H, W, d)
+    return logits.flatten(4).softmax(dim=4).view_as(logits)
+
+
+def _windows(height: int, width: int, window: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return rows and columns of each pixel's window, ``(H, 1, L, 1), (1, W, 1, L)``."""
+    rows = window_start(height, window, device)[:, None] + torch.arange(window, device=device)  # (H, L)
+    columns = window_start(width, window, device)[:, None] + torch.arange(window, device=device)  # (W, L)
+    return rows[:, None, :, None], columns[None, :, None, :]

@@ -1,0 +1,50 @@
+"""The class scores of a network as a map seen from above, beside its detections."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from beambox.detectors.kassd import KassdPredictions
+from beambox.detectors.voxel_rcnn import VoxelRcnnPredictions
+from beambox.infer.predictor import Detector
+from beambox.structures import Batch, Detections, Frame
+
+__all__ = ["detect_with_scores", "score_map"]
+
+
+@torch.inference_mode()
+def detect_with_scores(detector: Detector, frame: Frame) -> tuple[Detections, NDArray[np.float32] | None]:
+    """Detect in a sweep, and return the largest class score of each place.
+
+    Returns:
+        The detections, and ``(X, Y)`` scores in [0, 1], x forward up and y to the left; None where the network looks at
+        no point.
+    """
+    prepared = detector.prepare(frame)
+    if not detector.sees(prepared):
+        return Detections.empty(detector.classes, frame.id), None
+    predictions = detector.predict(Batch.of([prepared]).to(detector.device))
+    scores = score_map(detector, predictions)[0]  # (Y, X)
+    return detector.finish(predictions, [frame])[0], scores.T.flip(0, 1).numpy()
+
+
+def score_map(detector: Detector, predictions: Any) -> Tensor:
+    """Return the largest class score of each place's anchors, ``(B, Y, X)`` in [0, 1]; rows are y, columns x.
+
+    Args:
+        detector: who predicted.
+        predictions: of its network; of two stages, those of the first are shown.
+    """
+    head = predictions
+    if isinstance(predictions, KassdPredictions):
+        head = predictions.head
+    elif isinstance(predictions, VoxelRcnnPredictions):
+        head = predictions.first
+    rows, columns = detector.model.anchors.map_size(detector.grid)
+    best = torch.sigmoid(head.cls.float()).amax(dim=2)  # (B, N), anchors in the order (y, x, class, rotation)
+    return best.view(len(best), rows, columns, -1).amax(dim=3).cpu()
