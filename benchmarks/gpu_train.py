@@ -69,7 +69,7 @@ class Clock:
 
     def finishing(self) -> float:
         """Seconds to keep for exact statistics (a forward pass of 60 steps, new data workers) and for writing."""
-        return 20.0 + 40 * (self.pace or 0.2)
+        return 30.0 + 40 * (self.pace or 0.2)
 
     def left(self) -> float:
         """Seconds of training left in this sitting."""

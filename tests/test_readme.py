@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from beambox.cli.main import COMMANDS
+from beambox.cli.commands import COMMANDS
 from beambox.train.recipes import find_recipe, list_recipes
 from beambox.train.tables import TABLES
 from beambox.zoo import shipped

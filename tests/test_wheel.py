@@ -5,6 +5,7 @@ Long commands are shortened, and nothing else: fewer frames, one step of trainin
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import re
@@ -12,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -24,18 +26,26 @@ from oracles.tiny_detector import street
 
 SHORT = "--set optim.epochs=null --set optim.iterations=1 --set optim.batch=1 --set workers=0 --set augment=null"
 LONGER = {  # what shortens a command: a pattern in its words, and what comes in its place
-    "simulate": [(r"--frames \d+", "--frames 8"), (r"--sequence-length \d+", "--sequence-length 4")],
+    "simulate": [
+        (r"--frames \d+", "--frames 8"),
+        (r"--sequence-length \d+", ""),
+        (r"--format once", "--format once --sequence-length 2"),
+    ],
     "train": [(r"$", f" {SHORT}")],
     "ablate": [(r"--seeds [\d,]+", "--seeds 0"), (r"$", " --iterations 1 --set optim.batch=1 --set augment=null")],
     "bench": [(r"$", " --runs 2")],
 }
 DRIVER = """
-import glob, json, os, shlex, sys
+import glob, json, os, shlex, shutil, sys
 import beambox
 from beambox.cli.main import main
 assert beambox.__file__.startswith(sys.prefix), beambox.__file__
 for line in json.load(sys.stdin):
     words = [path for word in shlex.split(line) for path in (sorted(glob.glob(word)) if "*" in word else [word])]
+    if words[0] in ("simulate", "train"):  # a reader's folder is not there yet
+        made = words[1] if words[0] == "simulate" else words[words.index("--out") + 1] if "--out" in words else ""
+        if made and "--resume" not in words:
+            shutil.rmtree(made, ignore_errors=True)
     try:
         main(words)
         status = 0
@@ -115,11 +125,20 @@ def desk(python: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     head += f"WIDTH {len(points)}\nHEIGHT 1\n"
     text = "\n".join(" ".join(f"{value:.3f}" for value in row[:4]) for row in points)
     (folder / "drive" / "first" / "d.pcd").write_text(f"{head}POINTS {len(points)}\nDATA ascii\n{text}\n")
-    made = ["simulate kitti --frames 8 --val-share 0.5", "simulate once --frames 8 --format once --val-share 0.5"]
+    made = [
+        "simulate kitti --frames 10 --val-share 0.5",
+        "simulate once --frames 8 --format once --sequence-length 4 --val-share 0.5",
+    ]
     run(python, folder, [*made, "detect kitti --model pointpillars-sim --format kitti --out results"])
     shutil.copytree(folder / "kitti" / "training" / "label_2", folder / "label_2")
     shutil.copy(ROOT / "src" / "beambox" / "zoo" / "pointpillars-sim.safetensors", folder / "run" / "best.safetensors")
-    shutil.copytree(folder / "kitti", folder / "DIR" / "kitti")
+    for copy in ("DIR/kitti", "KITTI"):
+        shutil.copytree(folder / "kitti", folder / copy)
+    with tarfile.open(folder / "kitti_labels.tar.gz", "w:gz") as archive:
+        for part in ("label_2", "calib"):
+            archive.add(folder / "kitti" / "training" / part, f"training/{part}")
+    recorded = ROOT / "tests" / "fixtures" / "once_eval" / "annotations.json.gz"
+    (folder / "annotations.json").write_bytes(gzip.decompress(recorded.read_bytes()))
     return folder
 
 
@@ -135,7 +154,9 @@ def test_the_commands_of_a_page_run_one_after_the_other(page: Path, python: Path
             (place / "mine.yaml").write_text(block.text, encoding="utf-8")
     lines = [words for block in pages.blocks(page) if not block.mark for words in block.commands]
     assert all(words[0] == "beambox" for words in lines), "another program has no place in this test"
-    run(python, place, [shortened(words) for words in lines])
+    run(
+        python, place, [shortened(words) for words in lines if "drive.bag" not in words]
+    )  # tests/data/test_recording.py
 
 
 def test_the_python_of_the_readme_runs(python: Path, desk: Path) -> None:

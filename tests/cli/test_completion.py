@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from beambox.cli.completion import complete
-from beambox.cli.main import COMMANDS
+from beambox.cli.commands import COMMANDS
 from oracles.command_line import beambox
 
 

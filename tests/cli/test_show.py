@@ -165,9 +165,7 @@ def test_demo_without_weights_says_what_to_do(capsys: Capture, monkeypatch: pyte
     assert ran.status == 2 and "give them by --model" in ran.err
 
 
-def test_show_puts_several_sweeps_into_one_page_and_one_film(
-    capsys: Capture, weights: Path, tmp_path: Path
-) -> None:
+def test_show_puts_several_sweeps_into_one_page_and_one_film(capsys: Capture, weights: Path, tmp_path: Path) -> None:
     velodyne = kitti_folder(tmp_path / "kitti")
     ran = beambox(capsys, "show", velodyne, "-m", weights, "--out", tmp_path / "a.html", "--rate", "4")
     assert ran.status == 0 and "2 sweeps" in ran.out, ran.err

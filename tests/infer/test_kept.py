@@ -92,7 +92,7 @@ def test_other_files_are_refused_and_left_alone(content: bytes, message: str, tm
 
 @pytest.mark.parametrize(
     "damage",
-    [{"boxes": [[1, 2]]}, {"class_ids": [9]}, {"scores": []}, {"boxes": "x"}, {"boxes": [[1e999] * 7]}, {"frame": None}],
+    [{"boxes": [[1, 2]]}, {"class_ids": [9]}, {"scores": []}, {"boxes": "x"}, {"boxes": [[1e999] * 7]}, {"frame": 7}],
 )
 def test_damaged_lines_are_named(damage: dict[str, object], tmp_path: Path) -> None:
     path = tmp_path / "kept.jsonl"

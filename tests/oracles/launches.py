@@ -26,8 +26,8 @@ READS = (
     "bincount",
 )
 """Operations whose answer, or the size of it, the host waits for."""
-NOTHING = ("detach_", "lift_fresh")
-"""Operations that compute nothing."""
+NOTHING = ("detach_", "lift_fresh", "empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
+"""Operations that compute nothing: at most they take memory."""
 TAKEN_HOME = ("tolist", "cpu", "numpy", "__array__")
 """Methods that hand a tensor's values to the host; where it lies there already, no operation shows it."""
 SENT = ("tensor", "as_tensor", "from_numpy", "new_tensor", "asarray")
@@ -48,6 +48,8 @@ class Launches(TorchDispatchMode):
         """By name."""
         self.sent: Counter[str] = Counter()
         """Numbers brought from the host, by name."""
+        self.home: dict[int, Tensor] = {}
+        """What was brought home and what was made of it, by place; kept, so that nothing else comes to lie there."""
         self.bytes = 0
         """Of all arguments and results, as if each operation read and wrote every one once."""
 
@@ -65,9 +67,12 @@ class Launches(TorchDispatchMode):
         name = func.overloadpacket._qualified_op_name.split("::")[-1]
         if is_view(func) or name in NOTHING:
             return out
-        self.operations[name] += 1
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         made = [leaf for leaf in tree_leaves(out) if isinstance(leaf, Tensor)]
+        if given and all(place_of(tensor) in self.home for tensor in given):  # the host's own work
+            self.home.update((place_of(tensor), tensor) for tensor in made)
+            return out
+        self.operations[name] += 1
         self.bytes += sum(tensor.numel() * tensor.element_size() for tensor in (*given, *made))
         if name in READS or reads_by_mask(name, given) or goes_home(name, given, made):
             self.reads[name] += 1
@@ -80,21 +85,24 @@ class _Calls(TorchFunctionMode):
     def __init__(self, launches: Launches) -> None:
         super().__init__()
         self.launches = launches
-        self.home: dict[int, Tensor] = {}
-        """What was brought home, by its place, kept so that nothing else comes to lie there."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = getattr(func, "__name__", "")
-        if name in SENT:
+        if (name in SENT and not isinstance(args[0], Tensor | type(None))) or name == "new_tensor":
             self.launches.sent[name] += 1
         out = func(*args, **(kwargs or {}))
         if name in TAKEN_HOME:
-            place = args[0].untyped_storage().data_ptr()
-            if place not in self.home:  # what was brought home is read there without waiting
+            home = self.launches.home
+            if place_of(args[0]) not in home:  # what was brought home is read there without waiting
                 self.launches.reads[name] += 1
             if name == "cpu":
-                self.home[place] = out
+                home[place_of(out)] = out
         return out
+
+
+def place_of(tensor: Tensor) -> int:
+    """Return where a tensor's values lie."""
+    return tensor.untyped_storage().data_ptr()
 
 
 def is_view(func: Any) -> bool:

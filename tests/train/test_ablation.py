@@ -19,6 +19,7 @@ from beambox.train import ablation
 from beambox.train.ablation import Interrupted, Timed, merged, report, row_recipe, run_table, to_json, value_at
 from beambox.train.config import Recipe, parse_recipe, read_recipe
 from beambox.train.sources import open_source, shared_database
+from beambox.train.table_file import read_table
 from beambox.train.tables import TABLES, Column, Row, Table, levels, table_of
 from oracles import tiny_training
 
@@ -334,6 +335,44 @@ def test_a_missing_recipe_or_folder_is_said(tmp_path: Path, monkeypatch: pytest.
     assert 'no recipe is called "hcnet_smal" and no such file is there (did you mean "hcnet-small"?)' in str(error)
     error = run_command("hcnet-table3", "--data", str(tmp_path / "none")).exception
     assert str(error) == f"--data: there is no folder {tmp_path / 'none'}"
+
+
+def test_a_table_of_ones_own_is_trained_as_its_page_says(
+    tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "ablations.md").read_text(encoding="utf-8")
+    text = page.split("```yaml\n")[1].split("```")[0]
+    Path("mine.yaml").write_text(text, encoding="utf-8")
+    made = read_table(Path("mine.yaml"))
+    assert [(row.name, row.options) for row in made.rows] == [
+        ("without", {"absolute_xy": False}),
+        ("with", {"absolute_xy": True}),
+    ]
+    assert read_recipe(made.recipe).detector.name == "pointpillars"
+    Path("tiny.yaml").write_text(json.dumps(tiny_recipe().model_dump(mode="json")), encoding="utf-8")
+    words = ["--table", "mine.yaml", "--recipe", "tiny.yaml", "--iterations", "1", "--set", "optim.batch=1"]
+    done = run_command(*words)
+    assert done.exit_code == 0, done.output
+    assert "does it help to know where a pillar stands?" in done.output
+    assert done.output.count("ours ") >= 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title: x", "recipe: Field required"),
+        ("title: x\nrecipe: y\nclasses: [Car]\nrows: {}", "rows: Dictionary should have at least 1 item"),
+        ("title: x\nrecipe: y\nclasses: [Car]\nrows: {a: {}}\nrow: 1", "row: Extra inputs are not permitted"),
+        ("{", "is not valid YAML"),
+        ("", "the file: Input should be a valid dictionary"),
+    ],
+)
+def test_a_broken_table_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(BeamboxError, match=message):
+        read_table(tmp_path / "mine.yaml")
+    assert "one of the two" in str(run_command().exception)
 
 
 def test_the_papers_tables_hold_what_they_print() -> None:

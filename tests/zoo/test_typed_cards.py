@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from beambox.cli.main import COMMANDS
+from beambox.cli.commands import COMMANDS
 from beambox.infer.cards import read_card
 from beambox.zoo import shipped
 from oracles.tiny_detector import tiny_weights

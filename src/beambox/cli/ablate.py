@@ -13,7 +13,9 @@ __all__ = ["command"]
 
 
 def command(
-    table: Annotated[str, typer.Argument(help="Which table, as hcnet-table3; a wrong name lists them all.")],
+    table: Annotated[
+        str, typer.Argument(metavar="[TABLE]", help="Which table, as hcnet-table3; a wrong name lists them all.")
+    ] = "",
     data: Annotated[Path | None, typer.Option(help="Folder that {data} stands for in the recipe.")] = None,
     seeds: Annotated[str, typer.Option(help="One run of each row for each of these, as 0,1,2.")] = "0",
     iterations: Annotated[int | None, typer.Option(min=1, help="Steps of each run; the recipe's by default.")] = None,
@@ -21,6 +23,7 @@ def command(
     change: Annotated[
         list[str] | None, typer.Option("--set", help="Change a value of the recipe, in every row; may be repeated.")
     ] = None,
+    table_file: Annotated[Path | None, typer.Option("--table", help="YAML file of a table of your own.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of the runs; what is there already is not repeated.")] = Path(
         "runs/ablate"
     ),
@@ -32,9 +35,12 @@ def command(
     All rows share one recipe and one list of seeds and differ in their switches alone. Interrupted, the same command
     goes on where it stopped.
     """
+    from beambox.train.table_file import read_table
     from beambox.train.tables import table_of
 
-    chosen = table_of(table)
+    if bool(table) == (table_file is not None):
+        raise BeamboxError("name one of the papers' tables, or give a file with --table; one of the two")
+    chosen = read_table(table_file) if table_file is not None else table_of(table)
     if published:
         from beambox.train.ablation import report
 

@@ -49,7 +49,7 @@ def complete(words: Sequence[str]) -> list[str]:
     Args:
         words: after `beambox`, the last one unfinished and perhaps empty.
     """
-    from beambox.cli.main import COMMANDS
+    from beambox.cli.commands import COMMANDS
 
     *before, last = words or [""]
     if not before:
@@ -86,7 +86,7 @@ def _names(before: Sequence[str]) -> list[str]:
 def _click_command(name: str) -> Any:
     from importlib.metadata import EntryPoint
 
-    from beambox.cli.main import COMMANDS
+    from beambox.cli.commands import COMMANDS
 
     found = EntryPoint(name, COMMANDS[name][0], "beambox").load()
     if not isinstance(found, typer.Typer):

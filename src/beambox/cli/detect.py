@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +15,7 @@ from beambox.cli.console import announce, progress, say, show_log
 
 if TYPE_CHECKING:
     from beambox.infer.inputs import Sweep
+    from beambox.infer.jobs import Job
     from beambox.infer.predictor import Detector
     from beambox.structures import Detections, Frame
 
@@ -32,7 +33,9 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
         "detections"
     ),
-    formats: Annotated[str, typer.Option("--format", "-f", metavar="F", help="json, csv, kitti, or several.")] = "json",
+    formats: Annotated[
+        str, typer.Option("--format", "-f", metavar="F", help="json, csv, kitti, jsonl, parquet.")
+    ] = "json",
     min_score: options.MinScoreOption = 0.0,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
@@ -43,12 +46,16 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     fields: options.FieldsOption = "",
     device: options.DeviceOption = "auto",
     precision: options.PrecisionOption = "auto",
+    skip_existing: Annotated[bool, typer.Option("--skip-existing", help="Leave out sweeps that are done.")] = False,
+    shard: Annotated[str, typer.Option(metavar="I/N", help="Do the I-th of N parts, as on machine I of N.")] = "1/1",
+    workers: Annotated[int, typer.Option(min=1, metavar="W", help="Processes, of one thread each.")] = 1,
 ) -> None:
     """Find objects in sweeps; writes one result file a sweep.
 
     Examples:
       beambox detect scan.bin
       beambox detect kitti/training/velodyne --model run/best.safetensors --format kitti --out results
+      beambox detect sweeps --format parquet --shard 3/10 --workers 8 --skip-existing --out found
       beambox detect "drive/*.pcd" -m pointpillars-sim --range 50 --sensor-height 1.9 --axes "x: right, y: forward"
 
     Boxes are x y z l w h yaw in the sweep's own frame: centre, metres, radians counter-clockwise from +x. KITTI's
@@ -65,28 +72,50 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         say(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
 
     from beambox.infer.inputs import find_sweeps
+    from beambox.infer.jobs import TABLES, Job, choose_kinds, parse_shard
     from beambox.infer.predictor import load
-    from beambox.infer.results import choose_formats
 
     show_log()
-    kinds = choose_formats(formats)
+    part, kinds = parse_shard(shard), choose_kinds(formats)
     sweeps = find_sweeps(inputs)
     if "kitti" in kinds:
         need_calibration(sweeps)
-    detector = load(
-        model,
-        device=device,
-        precision=precision,
-        range=parsed_range,
-        view=view,  # pyright: ignore[reportArgumentType]  # load checks it
-        sensor_height=sensor_height,
-        axes=axes or None,
-        ground_slope=slope,
-        intensity_scale=intensity_scale,
-        fields=fields or None,
-    )
+    chosen: dict[str, Any] = {
+        "device": device,
+        "precision": precision,
+        "range": parsed_range,
+        "view": view,
+        "sensor_height": sensor_height,
+        "axes": axes or None,
+        "ground_slope": slope,
+        "intensity_scale": intensity_scale,
+        "fields": fields or None,
+    }
+    if skip_existing or workers > 1 or part != (0, 1) or set(kinds) & set(TABLES):
+        job = Job(model, chosen, out, kinds, min_score, part)
+        detect_many(sweeps, job, workers, skip_existing)
+        return
+    detector = load(model, **chosen)
     announce("detect", detail=f"{model} on {detector.device} in {str(detector.dtype).removeprefix('torch.')}")
     detect_all(detector, sweeps, out, kinds, model, min_score)
+
+
+def detect_many(sweeps: list[Sweep], job: Job, workers: int, skip_existing: bool) -> None:
+    """Detect in a shard of very many sweeps, without a line for each."""
+    from beambox.infer.jobs import run_job
+
+    start = time.perf_counter()
+    announce("detect", detail=f"{job.model}, shard {job.shard[0] + 1}/{job.shard[1]}, {workers} workers")
+    tally = run_job(sweeps, job, workers, skip_existing=skip_existing)
+    seconds = time.perf_counter() - start
+    for fault in tally.faults:
+        say(f"beambox: skipped: {fault}")
+    rate = tally.sweeps / seconds / workers if seconds else 0.0
+    say(
+        f"{tally.sweeps} sweeps, {tally.boxes} detections, {seconds:.1f} s, {rate:.2f} sweeps/s per worker -> {job.out}"
+    )
+    if tally.failed:
+        raise BeamboxError(f"{tally.failed} sweeps could not be read; the others are done")
 
 
 def detect_all(

@@ -151,7 +151,7 @@ class NuScenesSource:
         """
         token, data = self._frames[index]
         key = self._data[data]
-        to_lidar = np.linalg.inv(key.to_global)
+        to_lidar = np.linalg.inv(key.to_global).astype(np.float64)
         parts, following = [], data
         while following and len(parts) < self.sweeps:
             sweep = self._data[following]

@@ -38,7 +38,7 @@ from beambox.data.formats.ply import read_ply
 from beambox.data.formats.recording import read_message, recording_of
 from beambox.structures import Frame
 
-__all__ = ["SUFFIXES", "points_from_array", "read_frame", "read_points", "read_shifted"]
+__all__ = ["SUFFIXES", "frame_from_columns", "points_from_array", "read_frame", "read_points", "read_shifted"]
 
 READERS: dict[str, Callable[[Path], Columns]] = {
     ".npy": read_npy,
@@ -123,6 +123,18 @@ def points_from_array(
     """
     numbers = np.asarray(array.detach().cpu() if isinstance(array, Tensor) else array)
     return _assemble(array_columns(numbers, "the array of points"), "the array of points", None, intensity_scale)[:2]
+
+
+def frame_from_columns(
+    columns: Columns,
+    where: str,
+    *,
+    fields: str | Sequence[str] | None = None,
+    intensity_scale: float | None = None,
+) -> Frame:
+    """Turn columns that are in memory already, as of a message, into a frame; see :func:`read_frame`."""
+    points, notes, _ = _assemble(columns, where, _field_names(fields), intensity_scale)
+    return Frame(points, notes=notes)
 
 
 Assembled = tuple[Tensor, tuple[str, ...], tuple[float, float]]  # points, notes, what was taken from x and y

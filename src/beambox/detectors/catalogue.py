@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -48,7 +49,7 @@ def build(name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Build a detector by name.
 
     Args:
-        name: a key of :data:`CATALOGUE`.
+        name: a key of :data:`CATALOGUE`, or of a detector that an installed package brings (:func:`entry_of`).
         options: fields of its configuration that differ from the defaults, as plain values (from YAML or JSON).
 
     Raises:
@@ -59,10 +60,26 @@ def build(name: str, options: Mapping[str, Any] | None = None) -> Any:
 
 
 def entry_of(name: str) -> CatalogueEntry:
-    """Look a detector up."""
-    if name not in CATALOGUE:
-        raise BeamboxError(f'no detector is called "{name}"{did_you_mean(name, CATALOGUE)}')
-    return CATALOGUE[name]
+    """Look a detector up: one of ours, or an entry point of the group ``beambox.detectors`` of an installed package.
+
+    Such a package names a :class:`CatalogueEntry` in its pyproject.toml; it is imported when its name is asked for.
+
+    Raises:
+        BeamboxError: for an unknown name, or an entry point that is no :class:`CatalogueEntry`.
+    """
+    if name in CATALOGUE:
+        return CATALOGUE[name]
+    brought = {one.name: one for one in entry_points(group="beambox.detectors")}
+    if name not in brought:
+        raise BeamboxError(f'no detector is called "{name}"{did_you_mean(name, [*CATALOGUE, *brought])}')
+    entry = brought[name].load()
+    if not isinstance(entry, CatalogueEntry):
+        raise BeamboxError(
+            f'the entry point "{name}" of the group beambox.detectors ({brought[name].value}) must be a '
+            f"beambox.detectors.catalogue.CatalogueEntry, got {type(entry).__name__}"
+        )
+    CATALOGUE[name] = entry
+    return entry
 
 
 def name_of(model: nn.Module) -> str:

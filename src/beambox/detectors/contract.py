@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["DetectorConfig", "DetectorModel", "detections_from", "expect_made", "targets_from"]
+__all__ = ["DetectorConfig", "DetectorModel", "Foldable", "detections_from", "expect_made", "targets_from"]
 
 
 class DetectorConfig(Protocol):
@@ -33,6 +33,15 @@ class DetectorConfig(Protocol):
     @property
     def absolute_xy(self) -> bool:
         """Whether x and y enter as seen from the sensor, so that what was learnt holds in the trained region alone."""
+        ...
+
+
+@runtime_checkable
+class Foldable(Protocol):
+    """A layer with batch norms that can take them into its weights, for inference."""
+
+    def fold(self) -> None:
+        """Do so for good; what it computes in evaluation mode stays the same."""
         ...
 
 

@@ -50,7 +50,7 @@ from beambox.layers.anchors import AnchorClass, AnchorGrid
 from beambox.layers.bev import BN_EPS, BN_MOMENTUM, conv_bn_relu, deconv_bn_relu, join_levels
 from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss, select_boxes
 from beambox.layers.pillars import PillarFeatures
-from beambox.ops.dispatch import Backend, always, can_run_graph, choose
+from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_triton, choose, needs_gradient
 from beambox.ops.scatter import scatter_bev
 from beambox.ops.voxelize import Voxels, voxelize
 from beambox.structures.batch import Batch
@@ -295,8 +295,16 @@ def one_stack_a_voxel(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]
     return stacks, torch.stack((sample, torch.zeros_like(z), y, x), dim=1)
 
 
+def _can_run_on_gpu(features: Tensor) -> str | None:
+    """Return why stacks of zeros should not stand in for a number of pillars that a GPU would be waited for."""
+    if needs_gradient(features):
+        return "a gradient is asked for, and sizes are read in training anyway"
+    return can_run_triton(features)
+
+
 STACK_BACKENDS = (
     Backend("graph", can_run_graph, lambda: one_stack_a_voxel),
+    Backend("triton", _can_run_on_gpu, lambda: one_stack_a_voxel),
     Backend("reference", always, lambda: one_stack_a_pillar),
 )
 

@@ -18,6 +18,8 @@ import math
 import torch
 from torch import Tensor
 
+from beambox.geometry.constants import constant
+
 __all__ = [
     "axis_aligned_bev",
     "corners_3d",
@@ -76,6 +78,10 @@ def world_to_local(points: Tensor, boxes: Tensor) -> Tensor:
     return rotate_z(points - boxes[:, None, :3], -boxes[:, None, 6])
 
 
+SIGNS = ((1, 1, -1), (-1, 1, -1), (-1, -1, -1), (1, -1, -1), (1, 1, 1), (-1, 1, 1), (-1, -1, 1), (1, -1, 1))
+"""On which side of the centre each corner lies, x, y, z, in the order of :func:`corners_3d`."""
+
+
 def corners_3d(boxes: Tensor) -> Tensor:
     """Return the eight corners of each box.
 
@@ -86,9 +92,7 @@ def corners_3d(boxes: Tensor) -> Tensor:
         ``(N, 8, 3)`` metres: the bottom four counter-clockwise from front-left (front-left, rear-left, rear-right,
         front-right), then the top four in the same order.
     """
-    signs = boxes.new_tensor(
-        [[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]
-    )
+    signs = constant(SIGNS, boxes.device, boxes.dtype)
     local = boxes[:, None, 3:6] * signs / 2  # (N, 8, 3)
     return local_to_world(local, boxes)
 

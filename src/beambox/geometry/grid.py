@@ -90,7 +90,7 @@ class VoxelGrid:
 
     def contains(self, centres: Tensor) -> Tensor:
         """Tell which ``(N, 3 or more)`` positions lie in the closed region."""
-        low, high = centres.new_tensor(self.minimum), centres.new_tensor(self.maximum)
+        low, high = (constant(values, centres.device, centres.dtype) for values in (self.minimum, self.maximum))
         return ((centres[:, :3] >= low) & (centres[:, :3] <= high)).all(dim=1)
 
     def window(self, first: tuple[int, int], cells: tuple[int, int]) -> VoxelGrid:

@@ -7,6 +7,8 @@ import copy
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
+from beambox.detectors.contract import Foldable
+
 __all__ = ["fold_batch_norms"]
 
 
@@ -14,12 +16,16 @@ def fold_batch_norms(model: nn.Module) -> nn.Module:
     """Return a copy of a model for inference, with fewer passes over its maps.
 
     In every :class:`~torch.nn.Sequential`, a convolution (or linear layer) directly followed by a batch norm takes the
-    norm's scale and shift into its weights; the norm becomes an identity, so that names of layers stay.
+    norm's scale and shift into its weights; the norm becomes an identity, so that names of layers stay. Layers that
+    know how to fold themselves (:class:`beambox.detectors.contract.Foldable`) are asked to.
 
     Args:
         model: in any mode; neither it nor its mode is changed. The copy is in evaluation mode.
     """
     folded = copy.deepcopy(model).eval()  # batch statistics are only constant in evaluation mode
+    for part in folded.modules():
+        if isinstance(part, Foldable):
+            part.fold()
     for chain in folded.modules():
         if not isinstance(chain, nn.Sequential):
             continue

@@ -9,6 +9,7 @@ from itertools import product
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from beambox.geometry.boxes import local_to_world
 from beambox.geometry.constants import constant
@@ -54,6 +55,14 @@ class _Gather(nn.Module):
         for linear in (self.feature, self.offset, self.out):
             nn.init.kaiming_normal_(linear.weight)
 
+    def fold(self) -> None:
+        """Take the batch norms into the linear layers before them for good; training ends here."""
+        for name in ("feature", "offset", "out"):
+            norm = getattr(self, f"{name}_norm")
+            if isinstance(norm, nn.BatchNorm1d):
+                setattr(self, name, fuse_linear_bn_eval(getattr(self, name), norm))
+                setattr(self, f"{name}_norm", nn.Identity())
+
     def forward(self, points: Tensor, cells: Tensor, cell_features: SparseTensor, grid: VoxelGrid) -> Tensor:
         """Describe ``(M, 3)`` points in cells ``(M, 4)`` of full resolution: ``(M, channels)``."""
         level, sites = self.level, cell_features.sites
@@ -63,24 +72,23 @@ class _Gather(nn.Module):
         own = torch.cat((cells[:, :1], torch.div(cells[:, 1:], level.stride, rounding_mode="floor")), dim=1)
         found = voxel_query(points, own, sites, centres, level.reach, level.radius, level.samples)  # (M, S)
         none = found[:, :1] < 0
-        features = _normed(
-            self.feature(cell_features.features.to(self.feature.weight.dtype)), self.feature_norm
-        )  # (V, C)
+        kind = self.feature.weight.dtype
+        features = _normed(self.feature(cell_features.features.to(kind)), self.feature_norm)  # (V, C)
         row = found.clamp(min=0)
         if len(features) == 0:
             # the sum of no rows is zero and keeps every parameter in the graph, as processes in step need
             features, centres = features.sum(dim=0, keepdim=True), centres.new_zeros((1, 3))
         gathered = torch.where(none[..., None], 0.0, features[row])  # (M, S, C)
         away = torch.where(none[..., None], 0.0, centres[row] - points[:, None])  # (M, S, 3)
-        position = _normed(self.offset(away.to(self.offset.weight.dtype)).flatten(0, 1), self.offset_norm).unflatten(
-            0, found.shape
-        )
+        position = _normed(self.offset(away.to(kind)).flatten(0, 1), self.offset_norm).unflatten(0, found.shape)
         pooled = functional.relu((gathered + position).amax(dim=1))  # (M, C); ReLU and maximum commute
         return functional.relu(_normed(self.out(pooled), self.out_norm))
 
 
-def _normed(values: Tensor, norm: nn.BatchNorm1d) -> Tensor:
+def _normed(values: Tensor, norm: nn.Module) -> Tensor:
     """Normalise rows; by the running statistics where there are too few for statistics of their own."""
+    if not isinstance(norm, nn.BatchNorm1d):  # folded
+        return values
     training = norm.training and len(values) > 1
     if training:
         return norm(values)
@@ -95,6 +103,9 @@ class VoxelRoiPool(nn.Module):
     def __init__(self, in_channels: Sequence[int], levels: Sequence[PoolLevel], lattice: int = 6) -> None:
         super().__init__()
         self.lattice = lattice
+        steps = [(i + 0.5) / lattice - 0.5 for i in range(lattice)]
+        self.steps = tuple(product(steps, steps, steps))
+        """Where the points of a region lie, in its sizes from its centre."""
         self.levels = nn.ModuleList(
             _Gather(channels, level) for channels, level in zip(in_channels, levels, strict=True)
         )
@@ -102,8 +113,7 @@ class VoxelRoiPool(nn.Module):
 
     def grid_points(self, boxes: Tensor) -> Tensor:
         """Return ``lattice ** 3`` points in each box, evenly spread, z fastest: ``(R, 7)`` -> ``(R, G, 3)``."""
-        steps = [(i + 0.5) / self.lattice - 0.5 for i in range(self.lattice)]
-        local = constant(tuple(product(steps, steps, steps)), boxes.device, torch.float32)  # (G, 3)
+        local = constant(self.steps, boxes.device, torch.float32)  # (G, 3)
         return local_to_world(local * boxes[:, None, 3:6], boxes)
 
     def forward(self, rois: Rois, levels: Sequence[SparseTensor], grid: VoxelGrid) -> Tensor:

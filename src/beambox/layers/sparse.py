@@ -127,15 +127,17 @@ class SparseBlock(nn.Module):
     def __init__(self, conv: SubmanifoldConv3d | SparseConv3d) -> None:
         super().__init__()
         self.conv = conv
-        self.norm = nn.BatchNorm1d(conv.weight.shape[-1], eps=BN_EPS, momentum=BN_MOMENTUM)
+        self.norm: nn.BatchNorm1d | nn.Identity = nn.BatchNorm1d(
+            conv.weight.shape[-1], eps=BN_EPS, momentum=BN_MOMENTUM
+        )
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Map ``(V_in, C_in)`` features at sites to ``(V_out, C_out)``."""
+        if isinstance(self.norm, nn.Identity):
+            out = self.conv(x)
+            return out.with_features(functional.relu(out.features, inplace=not out.features.requires_grad))
         if not self.training:
-            mean, variance = self.norm.running_mean, self.norm.running_var
-            assert mean is not None and variance is not None
-            scale = self.norm.weight / torch.sqrt(variance + self.norm.eps)
-            out = self.conv(x, scale, self.norm.bias - mean * scale)
+            out = self.conv(x, *self.affine(self.norm))
             return out.with_features(functional.relu(out.features, inplace=not out.features.requires_grad))
         out = self.conv(x)
         if len(out.features) < 2:  # batch statistics need two values
@@ -150,6 +152,25 @@ class SparseBlock(nn.Module):
         else:
             features = self.norm(out.features)
         return out.with_features(functional.relu(features, inplace=True))
+
+    @staticmethod
+    def affine(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
+        """Return scale and shift of a batch norm in evaluation mode."""
+        mean, variance = norm.running_mean, norm.running_var
+        assert mean is not None and variance is not None
+        scale = norm.weight / torch.sqrt(variance + norm.eps)
+        return scale, norm.bias - mean * scale
+
+    @torch.no_grad()
+    def fold(self) -> None:
+        """Take the batch norm into the convolution for good; training ends here."""
+        if isinstance(self.norm, nn.Identity):
+            return
+        scale, shift = self.affine(self.norm)
+        bias = _affine(self.conv.bias, scale, shift)
+        self.conv.weight = nn.Parameter(self.conv.weight * scale)
+        self.conv.bias = None if bias is None else nn.Parameter(bias)
+        self.norm = nn.Identity()
 
 
 def submanifold_block(in_channels: int, channels: int, kernel: int | Triple = 3) -> SparseBlock:

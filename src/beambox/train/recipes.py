@@ -75,7 +75,8 @@ def find_recipe(name: str | Path) -> Path:
     word = path.name.removesuffix(".yaml")
     alike = {known.replace("_", "-"): known for known in files}
     same = alike.get(word.replace("_", "-"))
-    hint = f' (did you mean "{same}"?)' if same else did_you_mean(word, files)
+    near = did_you_mean(word, files)
+    hint = f' (did you mean "{same}"?)' if same else near if near.startswith(" (did") else ""  # the list is long
     raise MissingFileError(
         f'no recipe is called "{name}" and no such file is there{hint}; `beambox recipes` lists the shipped ones'
     )

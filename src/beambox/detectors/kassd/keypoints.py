@@ -20,12 +20,14 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, choose_fields
 from beambox.geometry.boxes import rotate_z
+from beambox.geometry.constants import constant
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.bev import conv_bn_relu
 
@@ -110,12 +112,18 @@ class KeypointLayout:
         Returns:
             ``(N, count, 2)`` x, y in metres.
         """
-        unit = self.unit().to(boxes)
+        unit = constant(_places(self), boxes.device, boxes.dtype)  # (K, 2)
         local = unit * boxes[:, None, 3:5]  # (N, K, 2)
         placed = rotate_z(local, boxes[:, None, 6]) + boxes[:, None, :2]
         if self.d and self.extra_point is ExtraPoint.ANCHOR:
             placed = torch.cat((placed[:, :-1], anchors[:, None].to(boxes)), dim=1)
         return placed
+
+
+@cache
+def _places(layout: KeypointLayout) -> tuple[tuple[float, ...], ...]:
+    """Return what :meth:`KeypointLayout.unit` does, as numbers."""
+    return tuple(tuple(row) for row in layout.unit().tolist())
 
 
 def map_coordinates(points: Tensor, grid: VoxelGrid, stride: int) -> Tensor:
@@ -124,8 +132,8 @@ def map_coordinates(points: Tensor, grid: VoxelGrid, stride: int) -> Tensor:
     Column 0 lies on the region's border, not half a cell inside: a strided 3 x 3 convolution with padding 1 looks
     around the first voxel of its cell.
     """
-    low = points.new_tensor(grid.minimum[:2])
-    return (points - low) / (points.new_tensor(grid.cell[:2]) * stride)
+    low, cell = (constant(values[:2], points.device, points.dtype) for values in (grid.minimum, grid.cell))
+    return (points - low) / (cell * stride)
 
 
 def sample_bilinear(maps: Tensor, sample: Tensor, channel: Tensor, at: Tensor) -> Tensor:
@@ -141,7 +149,7 @@ def sample_bilinear(maps: Tensor, sample: Tensor, channel: Tensor, at: Tensor) -
         ``(...)``; differentiable with respect to ``maps`` and ``at``.
     """
     _, channels, height, width = maps.shape
-    limit = at.new_tensor([width, height])
+    limit = constant((width, height), at.device, at.dtype)
     at = torch.minimum(at.clamp(min=-2.0), limit + 1.0)  # far outside is outside; keeps the index within int64
     corner = torch.floor(at).long()  # (..., 2)
     share = at - corner

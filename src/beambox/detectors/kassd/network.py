@@ -56,10 +56,14 @@ from beambox.layers.heads import (
     PostProcess,
     anchor_loss,
     best_anchors,
+    best_of_samples,
+    of_rows,
     select_boxes,
+    suppressed,
 )
 from beambox.layers.losses import sigmoid_focal
 from beambox.layers.roi import best_overlap
+from beambox.ops.dispatch import waiting_is_dear
 from beambox.ops.nms import nms
 from beambox.ops.voxelize import Voxels, voxelize
 from beambox.structures.batch import Batch
@@ -234,6 +238,8 @@ class Candidates:
     """``(N,)`` int64, ascending."""
     quality: Tensor | None
     """``(N,)`` largest 3-D overlap with an object of the box's class; None without labels."""
+    valid: Tensor | None = None
+    """``(N,)`` bool, where each sample has as many boxes, so that no GPU is waited for; None where all exist."""
 
 
 @dataclass(frozen=True)
@@ -333,6 +339,8 @@ class Kassd(nn.Module):
         Without labels: the head's best. With labels: more of them, the labelled boxes, and how good each is.
         """
         of_samples = range(len(head.cls))
+        if labels is None and waiting_is_dear(head.cls):
+            return self.best_of_samples(head)
         if labels is None:
             chosen = [self.best_boxes(head, sample, self.config.kam_options.test_boxes) for sample in of_samples]
         else:
@@ -346,6 +354,22 @@ class Kassd(nn.Module):
             torch.cat([c.places for c in chosen]),
             torch.cat([c.sample for c in chosen]),
             quality,
+        )
+
+    def best_of_samples(self, head: AnchorPredictions) -> Candidates:
+        """Return as many of each sample's best boxes, without asking how many reach the threshold."""
+        options = self.config.kam_options
+        score, label = head.cls.float().max(dim=-1)  # (B, N)
+        score, rows, count = best_of_samples(torch.sigmoid(score), options.threshold, options.test_boxes)
+        place = torch.arange(rows.numel(), device=rows.device)
+        return Candidates(
+            head.decoded_places(rows).flatten(0, 1),
+            label.gather(1, rows).flatten(),
+            score.flatten(),
+            head.anchors[rows, :2].flatten(0, 1),
+            place // max(1, rows.shape[1]),
+            None,
+            place % max(1, rows.shape[1]) < count.repeat_interleave(rows.shape[1]),
         )
 
     def best_boxes(self, head: AnchorPredictions, sample: int, limit: int, least: int = 0) -> Candidates:
@@ -395,6 +419,11 @@ class Kassd(nn.Module):
         score = torch.sigmoid(scores.float())
         if self.config.kam_options.score is KamScore.MULTIPLY:
             score = score * found.cls
+        if found.valid is not None:
+            score = torch.where(found.valid, score, torch.nan).view(batch_size, -1)  # (B, N / B)
+            score, rows, count = best_of_samples(score, post.score_threshold, post.nms_pre)
+            boxes = of_rows(found.boxes.view(batch_size, -1, 7), rows)
+            return suppressed(boxes, score, found.classes.view(batch_size, -1).gather(1, rows), count, post)
         for sample in range(batch_size):
             row = torch.nonzero((found.sample == sample) & (score >= post.score_threshold))[:, 0]
             row = row[nms(found.boxes[row], score[row], post.nms_iou, post.nms_pre, post.nms_post)]

@@ -16,7 +16,8 @@ def neighborhood_attention(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, window
     ``softmax(q . k / sqrt(d) + bias) . v`` over the pixels of the window.
     """
     weights = neighborhood_weights(q, k, bias, window)
-    return (weights[..., None] * v[(..., *_windows(q.shape[2], q.shape[3], window, q.device), slice(None))]).sum(dim=(4, 5))
+    seen = v[(..., *_windows(q.shape[2], q.shape[3], window, q.device), slice(None))]  # (B, heads, H, W, k, k, d)
+    return (weights[..., None] * seen).sum(dim=(4, 5))
 
 
 def neighborhood_weights(q: Tensor, k: Tensor, bias: Tensor, window: int = 7) -> Tensor:

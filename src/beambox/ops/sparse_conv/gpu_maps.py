@@ -25,8 +25,8 @@ BLOCK = 128
 def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
     """Find the input row that reaches each output through each offset; see ``reference.neighbour_table``."""
     rows, offsets = len(target), geometry.offsets
-    table = torch.full((rows, offsets), -1, dtype=torch.int32, device=source.sorted_keys.device)
-    if rows and len(source):
+    table = torch.empty((rows, offsets), dtype=torch.int32, device=source.sorted_keys.device)
+    if rows:
         _look_up[(triton.cdiv(rows, BLOCK), offsets)](
             source.sorted_keys, source.order, target.sorted_keys, target.order, table, rows, len(source),
             len(source).bit_length(), *target.shape, *source.shape, offsets, *geometry.kernel[1:], *geometry.stride,
@@ -59,7 +59,10 @@ def find_levels(source: Sites, geometries: Sequence[Geometry]) -> list[Sites]:
         maps.append(active)
         shapes.append(shape)
     counts = torch.stack([active.sum(dtype=torch.int64) for active in maps]).tolist()
-    found = [torch.nonzero_static(active, size=count)[:, 0] for active, count in zip(maps, counts)]
+    found = [
+        torch.nonzero_static(active, size=count).flatten() if count else active[:0].long()
+        for active, count in zip(maps, counts)
+    ]
     return [Sites.from_keys(keys, shape, batch) for keys, shape in zip(found, shapes)]
 
 
@@ -88,7 +91,7 @@ def _look_up(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     there = inside & (low < sources)
     hit = there & (tl.load(keys + low, there, -1) == wanted)
     row = tl.load(target_order + at, has, 0)
-    tl.store(table + row * offsets + k, tl.load(order + low, hit, -1).to(tl.int32), hit)
+    tl.store(table + row * offsets + k, tl.load(order + low, hit, -1).to(tl.int32), has)
 
 
 @triton.jit

@@ -1,0 +1,113 @@
+"""`beambox stream`: boxes for every sweep of a recording, written back as a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from beambox.checks import BeamboxError
+from beambox.cli import options
+from beambox.cli.console import announce, say, show_log
+
+if TYPE_CHECKING:
+    from beambox.infer.predictor import Detector
+
+__all__ = ["command"]
+
+
+def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="Recording (.mcap, .bag, .db3), or folder of sweeps.")
+    ],
+    model: options.ModelOption,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The .mcap file to write.")],
+    topic: Annotated[str, typer.Option(metavar="T", help="Of the point clouds, where there are several.")] = "",
+    track: Annotated[bool, typer.Option("--track/--no-track", help="Give objects identities and velocities.")] = True,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Play as recorded; drop old sweeps to keep up.")] = False,
+    speed: Annotated[float, typer.Option(metavar="X", help="With --realtime: play X times as fast.")] = 1.0,
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Sweeps per second of a folder.")] = 10.0,
+    min_score: options.MinScoreOption = 0.1,
+    range_: options.RangeOption = "",
+    view: options.ViewOption = "auto",
+    sensor_height: options.HeightOption = None,
+    axes: options.AxesOption = "",
+    ground_slope: options.SlopeOption = "",
+    intensity_scale: options.IntensityOption = None,
+    fields: options.FieldsOption = "",
+    device: options.DeviceOption = "auto",
+    precision: options.PrecisionOption = "auto",
+) -> None:
+    """Detect and track through a recording, read once; boxes keep its stamps and frame ids.
+
+    Examples:
+      beambox stream drive.mcap --model pointpillars-kitti --out boxes.mcap
+      beambox stream drive.bag -m voxel_rcnn-kitti --topic /velodyne_points --range 50 --out boxes.mcap
+      beambox stream drive.db3 -m pointpillars-kitti --realtime --out boxes.mcap
+
+    Written for each sweep, below its topic: beambox/markers (MarkerArray), beambox/detections (Detection3DArray) and
+    beambox/scene (Foxglove SceneUpdate).
+    """
+    from beambox.infer.predictor import load
+    from beambox.stream.run import in_real_time, recording_writer, run_stream
+    from beambox.stream.source import arrivals
+
+    show_log()
+    if not (rate > 0 and speed > 0):
+        raise BeamboxError(f"--rate and --speed must be above 0, got {rate:g} and {speed:g}")
+    if not source.exists() and not any(parent.is_file() for parent in source.parents):
+        raise BeamboxError(f"{source} is not there")
+    if out.resolve() == source.resolve():
+        raise BeamboxError(f"{out} is the recording that is read; give another name")
+    tracker = None
+    if track:
+        from beambox.track import Tracker, TrackerOptions
+
+        tracker = Tracker(TrackerOptions(min_score=min_score, birth_score=max(0.3, min_score)), rate=rate)
+    detector = load(
+        model,
+        device=device,
+        precision=precision,
+        range=options.parse_range(range_),
+        view=view,  # pyright: ignore[reportArgumentType]  # load checks it
+        sensor_height=sensor_height,
+        axes=axes or None,
+        ground_slope=options.parse_slope(ground_slope),
+        intensity_scale=intensity_scale,
+        fields=fields or None,
+    )
+    announce("stream", detail=f"{model} on {detector.device} in {str(detector.dtype).removeprefix('torch.')}")
+    told = {"model": model, "source": source.name, "topic": topic, "track": track, "min_score": min_score}
+    told |= {"range": range_, "view": view, "sensor_height": sensor_height, "axes": axes, "precision": precision}
+    dropped: list[str] = []
+    sweeps = arrivals(source, topic, rate=rate, fields=fields or None, intensity_scale=intensity_scale)
+    if realtime:
+        warm_up(detector)
+        sweeps = in_real_time(sweeps, lambda sweep: dropped.append(sweep.name), speed=speed)
+    with recording_writer(out, told) as write:
+        report = run_stream(
+            sweeps,
+            lambda frame: detector.detect([frame])[0],
+            tracker,
+            write,
+            min_score=min_score,
+            notice=lambda text: say(f"beambox: {text}"),
+        )
+        report.dropped = len(dropped)
+        if not report.done:
+            raise BeamboxError(f"{source}: no sweep could be read, so nothing was written")
+    say(report.text())
+    print(f"{report.done} sweeps, {report.objects} boxes -> {out}")
+
+
+def warm_up(detector: Detector) -> None:
+    """Detect once in random points: the first sweep would otherwise wait for what is compiled then."""
+    import torch
+
+    from beambox.structures import Frame
+
+    low, high = torch.tensor(detector.grid.minimum), torch.tensor(detector.grid.maximum)
+    points = torch.rand(20_000, 4, generator=torch.Generator().manual_seed(0))
+    points[:, :3] = low + points[:, :3] * (high - low)
+    detector.detect([Frame(points.float())])
