@@ -136,3 +136,14 @@ def test_voxel_query_compiles(values):
         gpu._search, points=values, cells="*i64", centres=values, keys="*i64", order="*i64", found="*i64", limit=values,
         **dict.fromkeys(sizes, "i32"), block=gpu.BLOCK,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("values", ["*fp32", "*fp64"])
+def test_voxelization_compiles(values):
+    from beambox.ops.voxelize import gpu
+
+    sizes = {"count": "i32", "row_step": "i32", "column_step": 1, "none": "i64", "nz": "i32", "ny": "i32", "nx": "i32"}
+    compile_kernel(
+        gpu._find_cells, points=values, sample="*i64", borders=values, key="*i64", **sizes, single=values == "*fp32",
+        block=256,
+    )  # fmt: skip

@@ -65,12 +65,12 @@ class Launches(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
         name = func.overloadpacket._qualified_op_name.split("::")[-1]
-        if is_view(func) or name in NOTHING:
-            return out
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         made = [leaf for leaf in tree_leaves(out) if isinstance(leaf, Tensor)]
         if given and all(place_of(tensor) in self.home for tensor in given):  # the host's own work
             self.home.update((place_of(tensor), tensor) for tensor in made)
+            return out
+        if is_view(func) or name in NOTHING:
             return out
         self.operations[name] += 1
         self.bytes += sum(tensor.numel() * tensor.element_size() for tensor in (*given, *made))

@@ -1,11 +1,19 @@
-"""Voxelization for a GPU: the definition's result by sorts alone, the host waiting once, for the two sizes."""
+"""Voxelization for a GPU: the definition's result by sorts, the host waiting once, for the two sizes.
+
+Cells are found by a kernel (Triton) whose division rounds as the definition's does; sorts and sums are PyTorch's own.
+"""
+# pyright: reportArgumentType=false, reportOperatorIssue=false
 
 from __future__ import annotations
 
 import torch
+import triton
+import triton.language as tl
 from torch import Tensor
 
+from beambox.geometry.constants import constant
 from beambox.geometry.grid import VoxelGrid
+from beambox.ops.sparse_conv.gpu_indices import indices_of
 from beambox.ops.voxelize.voxels import Voxels
 
 __all__ = ["voxelize"]
@@ -30,9 +38,12 @@ def voxelize(
         return Voxels(points, nothing, nothing, nothing.new_zeros(0, 4), batch_size, grid)
     nz, ny, nx = grid.shape
     none = batch_size * nz * ny * nx
-    position, inside = grid.index(points)
-    z, y, x = position.unbind(dim=1)
-    key = torch.where(inside, ((sample * nz + z) * ny + y) * nx + x, none)
+    key = torch.empty(count, dtype=torch.int64, device=device)
+    borders = constant((*grid.minimum, *grid.cell), device, points.dtype)
+    given, kind = points.detach(), points.dtype == torch.float32
+    _find_cells[(triton.cdiv(count, 256),)](
+        given, sample, borders, key, count, *given.stride(), none, nz, ny, nx, kind, 256
+    )
     key, scan = torch.sort(key, stable=True)  # (N,), and the points' rows, in scan order inside a cell
     row = torch.arange(count, device=device)
 
@@ -58,18 +69,43 @@ def voxelize(
     depth = row - start[run]  # (N,) points of the cell before
     kept = exists[run] if max_points is None else exists[run] & (depth < max_points)
     voxel, by_voxel = torch.sort(torch.where(kept, number[run], count), stable=True)
-    index = _indices(cell, torch.where(exists, number, count), count, grid)
+    by_number = torch.zeros(count + 1, dtype=torch.int64, device=device)  # cells, and one that takes all the others
+    by_number.scatter_(0, torch.where(exists, number, count), cell)
 
     sizes = torch.stack((kept.sum(), exists.sum())).tolist()  # the host waits
-    voxel, index = voxel[: sizes[0]], index[: sizes[1]]
+    voxel, index = voxel[: sizes[0]], indices_of(by_number[: sizes[1]], row[: sizes[1]], grid.shape)
     edges = torch.searchsorted(voxel, torch.arange(sizes[1] + 1, device=device))  # (V + 1,)
     return Voxels(points[scan[by_voxel[: sizes[0]]]], voxel, edges[1:] - edges[:-1], index, batch_size, grid)
 
 
-def _indices(cell: Tensor, number: Tensor, count: int, grid: VoxelGrid) -> Tensor:
-    """Return ``(N + 1, 4)`` (sample, z, y, x) by number of the voxel."""
-    nz, ny, nx = grid.shape
-    by_number = torch.zeros(count + 1, dtype=torch.int64, device=cell.device).scatter_(0, number, cell)
-    rest, x = by_number // nx, by_number % nx
-    rest, y = rest // ny, rest % ny
-    return torch.stack((rest // nz, rest % nz, y, x), dim=1)
+@triton.jit
+def _find_cells(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
+    points, sample, borders, key, count, row_step, column_step, none, nz, ny, nx, single: tl.constexpr,
+    block: tl.constexpr,
+):  # fmt: skip
+    """Write the linear position of each point's cell, ``none`` where it lies outside."""
+    at = tl.program_id(0) * block + tl.arange(0, block)
+    has = at < count
+    place = points + at.to(tl.int64) * row_step
+    x = _steps(place, borders, has, 0, column_step, single)
+    y = _steps(place, borders, has, 1, column_step, single)
+    z = _steps(place, borders, has, 2, column_step, single)
+    inside = has & (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)  # NaN lies outside
+    x, y, z = (
+        tl.where(inside, x, 0.0).to(tl.int64),
+        tl.where(inside, y, 0.0).to(tl.int64),
+        tl.where(inside, z, 0.0).to(tl.int64),
+    )
+    cell = ((tl.load(sample + at, has, 0) * nz + z) * ny + y) * nx + x
+    tl.store(key + at, tl.where(inside, cell, none), has)
+
+
+@triton.jit
+def _steps(place, borders, has, axis: tl.constexpr, column_step, single: tl.constexpr):
+    """Count whole cells from the border, as a floating-point number."""
+    away = tl.load(place + axis * column_step, has, 0.0) - tl.load(borders + axis)
+    edge = tl.load(borders + 3 + axis)
+    if single:
+        return tl.floor(tl.div_rn(away, edge + tl.zeros_like(away)))
+    else:
+        return tl.floor(away / edge)
