@@ -84,7 +84,7 @@ def test_pages_hold_names_as_text_only(name: str) -> None:
     for mark in ("<script", "</script", "<!--", "<img", "<title", "</title", "<"):
         assert text.count(mark) == plain_text.count(mark), mark
     data = text[text.index('type="application/json">') + 24 :].partition("</script>")[0]
-    assert json.loads(data)["legend"][0]["words"] == name
+    assert json.loads(data)["classes"][0]["name"] == name
 
 
 @pytest.mark.parametrize("name", ["two\nlines", "\x1b[31m", LONG, "\udce9", "\u202e", "", " ", "\x00"])

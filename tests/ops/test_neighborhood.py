@@ -143,3 +143,24 @@ def test_attention_tells_what_is_wrong():
         neighborhood_attention(q, q, q, bias, window=4)
     with pytest.raises(BeamboxError, match=r"`v` must be float32, got float64"):
         neighborhood_attention(q, q, q.double(), bias)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_on_the_cpu_takes_the_fast_version_in_float32(dtype, monkeypatch) -> None:
+    import beambox.ops.neighborhood as door
+
+    chosen = []
+    real = door.choose
+    monkeypatch.setattr(
+        door, "choose", lambda name, backends, *given: chosen.append(given) or real(name, backends, *given)
+    )
+    generator = torch.Generator().manual_seed(3)
+    q, k, v = (torch.randn(1, 2, 9, 8, 4, generator=generator).to(dtype).requires_grad_() for _ in range(3))
+    bias = torch.randn(2, 13, 13, generator=generator)
+    out = door.neighborhood_attention(q, k, v, bias, 7)
+    assert out.dtype == dtype
+    assert [tensor.dtype for tensor in chosen[0]] == [torch.float32] * 4
+    expected = door.reference.neighborhood_attention(q.double(), k.double(), v.double(), bias.double(), 7)
+    assert torch.allclose(out.double(), expected, atol=2e-2)
+    out.sum().backward()
+    assert all(tensor.grad is not None and tensor.grad.dtype == dtype for tensor in (q, k, v))

@@ -33,7 +33,7 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
     "--window-size=1000,700",
-    "--virtual-time-budget=20000",
+    "--virtual-time-budget=240000",
 )
 
 
@@ -50,7 +50,7 @@ def run_in_browser(page: str, script: str, folder: Path) -> dict[str, Any]:
     const faults = [];
     addEventListener("error", (event) => faults.push(String(event.message)));
     async function until(test) {{
-      for (let k = 0; k < 400; k++) {{ if (test()) return; await new Promise((done) => setTimeout(done, 25)); }}
+      for (let k = 0; k < 4000; k++) {{ if (test()) return; await new Promise((done) => setTimeout(done, 25)); }}
       throw new Error("waited in vain for " + test);
     }}
     (async () => {{ {script} }})().catch((error) => ({{ error: String(error) }})).then((outcome) => {{
@@ -63,10 +63,15 @@ def run_in_browser(page: str, script: str, folder: Path) -> dict[str, Any]:
     before, _, after = page.rpartition("</body>")
     path = folder / "page.html"
     path.write_text(before + probe + after, encoding="utf-8")
-    command = [CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()]
-    output = subprocess.run(command, capture_output=True, timeout=120, check=False).stdout.decode("utf-8")
-    outcome = re.search(r'<pre id="outcome">(.*?)</pre>', output, flags=re.DOTALL)
-    assert outcome is not None, f"the page gave no answer: {output[-500:]}"
-    told = json.loads(html.unescape(outcome.group(1)))
-    assert not told["faults"] and "error" not in told, told
+    told: dict[str, Any] = {"error": "the page gave no answer"}
+    for attempt in range(3):  # the browser's clock runs ahead of its work where the machine is busy
+        profile = folder / f"profile{attempt}"
+        command = [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", "--dump-dom", path.as_uri()]
+        output = subprocess.run(command, capture_output=True, timeout=180, check=False).stdout.decode("utf-8")
+        outcome = re.search(r'<pre id="outcome">(.*?)</pre>', output, flags=re.DOTALL)
+        if outcome is not None:
+            told = json.loads(html.unescape(outcome.group(1)))
+            if "waited in vain" not in told.get("error", ""):
+                break
+    assert not told.get("faults") and "error" not in told, told
     return told

@@ -48,7 +48,8 @@ def draw_maps(
     from matplotlib.figure import Figure
 
     width = 4.2 * len(maps) + 0.6
-    tall = 3.9 * (grid.maximum[0] - grid.minimum[0]) / (grid.maximum[1] - grid.minimum[1])
+    x, y = _shown_part([bev for _, bev in maps], grid)
+    tall = 3.9 * (x[1] - x[0]) / (y[1] - y[0])
     figure = Figure(figsize=(width, min(12.0, max(3.4, tall + 1.0))), layout="constrained")
     axes = figure.subplots(1, len(maps), squeeze=False)[0]
     values = np.concatenate([each.numpy().ravel() for _, each in maps])
@@ -63,7 +64,7 @@ def draw_maps(
         )  # fmt: skip
         each.set_facecolor("#101418")
         _outlines(each, boxes)
-        each.set(xlim=(grid.maximum[1], grid.minimum[1]), ylim=(grid.minimum[0], grid.maximum[0]), xlabel="y, m")
+        each.set(xlim=(y[1], y[0]), ylim=x, xlabel="y, m")
         each.set_title(name, fontsize=9)
     axes[0].set_ylabel("x, m")
     if shown is not None:
@@ -118,6 +119,18 @@ def draw_bars(series: Sequence[tuple[str, Tensor]], title: str, label: str) -> I
     axes.legend(fontsize=8)
     axes.set_title(title, fontsize=10)
     return _picture(figure)
+
+
+def _shown_part(maps: Sequence[Tensor], grid: VoxelGrid) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return limits of x and y: what is not empty in any of the maps, and 2 m around it."""
+    rows, columns = torch.nonzero(torch.stack([bev.isfinite() for bev in maps]).any(dim=0)).unbind(dim=1)
+    limits = []
+    for axis, at, size in ((0, columns, maps[0].shape[1]), (1, rows, maps[0].shape[0])):
+        low, high = grid.minimum[axis], grid.maximum[axis]
+        edge = (high - low) / size
+        first, last = (float(at.min()), float(at.max())) if len(at) else (0.0, size - 1.0)
+        limits.append((max(low, low + first * edge - 2), min(high, low + (last + 1) * edge + 2)))
+    return limits[0], limits[1]
 
 
 def _outlines(axes: Any, boxes: Tensor) -> None:
