@@ -68,7 +68,12 @@ def _numba_targets() -> Callable[..., Tensor]:
 def _triton_targets() -> Callable[..., Tensor]:
     from beambox.ops.sparse_conv.gpu_maps import find_levels
 
-    return lambda sites, geometry: find_levels(sites, (geometry,))[0].sorted_keys
+    def find_targets(sites: Sites, geometry: Geometry) -> Tensor:
+        if not _maps_fit(sites, (geometry,)):
+            return reference.find_targets(sites, geometry)
+        return find_levels(sites, (geometry,))[0].sorted_keys
+
+    return find_targets
 
 
 BACKENDS = (
@@ -91,8 +96,7 @@ def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
     if geometry.submanifold:
         target = sites
     else:
-        backends = TARGET_BACKENDS if _maps_fit(sites, (geometry,)) else TARGET_BACKENDS[1:]
-        keys = choose("find_targets", backends, sites.sorted_keys)(sites, geometry)
+        keys = choose("find_targets", TARGET_BACKENDS, sites.sorted_keys)(sites, geometry)
         target = Sites.from_keys(keys, geometry.output_shape(sites.shape), sites.batch_size)
     found = KernelMap(sites, target, geometry)
     sites.maps[geometry] = found
