@@ -7,6 +7,7 @@ few square metres. Kernels whose values decide nothing are not run: a launch is 
 import os
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -71,6 +72,15 @@ def sweeps(grid, size):
     return Batch(points, torch.arange(size).repeat_interleave(40), size)
 
 
+def stages_of(model, total):
+    """Note how many launches each part of a network and what lies before it take; returns the notes."""
+    notes = [("", 0)]
+    for name, part in model.named_children():
+        part.register_forward_pre_hook(lambda *_, n=name: notes.append((f"before {n}", total())))
+        part.register_forward_hook(lambda *_, n=name: notes.append((n, total())))
+    return notes
+
+
 @pytest.mark.parametrize(("name", "size"), [*((name, 1) for name in CATALOGUE), ("second", 3), ("hcnet", 3)])
 def test_a_pass_is_few_launches_and_hardly_waits(name, size, kernels):
     detector = Detector(shrunk(name), device="cpu", precision="float32")
@@ -78,8 +88,10 @@ def test_a_pass_is_few_launches_and_hardly_waits(name, size, kernels):
     with torch.inference_mode():
         detector.model.decode(detector.predict(batch))  # what is made once is made now
     kernels.clear()
+    network = Launches()
+    notes = stages_of(detector.model, lambda: sum(network.operations.values()) + sum(kernels.values()))
     with torch.inference_mode():
-        with Launches() as network:
+        with network:
             predictions = detector.predict(batch)
         before = kernels.copy()
         with Launches() as decoding:
@@ -87,7 +99,9 @@ def test_a_pass_is_few_launches_and_hardly_waits(name, size, kernels):
     kernels_of_network = sum(before.values())
     launched = (sum(network.operations.values()) + kernels_of_network, sum(decoding.operations.values()))
     decoded = launched[1] + sum(kernels.values()) - kernels_of_network
-    print(f"\n| {name} | {size} | {launched[0]} | {decoded} | {dict(network.reads)} | {dict(decoding.reads)} |")
+    stages = [f"{part} {count - before}" for (_, before), (part, count) in pairwise(notes) if count > before]
+    stages += [f"after {launched[0] - notes[-1][1]}"]
+    print(f"\n| {name} | {launched[0]} | {decoded} | {', '.join(stages)} |")
     assert launched[0] <= MOST["network"], (network.operations, before)
     assert decoded <= MOST["decoding"], (decoding.operations, kernels)
     assert sum(network.reads.values()) == (2 if name in SPARSE else 1), network.reads
