@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from beambox.cli.completion import complete
 from beambox.cli.commands import COMMANDS
+from beambox.cli.completion import complete
 from oracles.command_line import beambox
 
 

@@ -66,7 +66,7 @@ def test_the_page_runs_as_printed(
     told = run_block(f"beambox evaluate {weights} --data data.yaml --split val --json ap.json", capsys)
     assert "2 frames" in told and "every object counts" in told
     scores = json.loads(Path("ap.json").read_text(encoding="utf-8"))
-    assert list(scores["Car"]) == ["iou", "3d", "bev"] and len(scores["Car"]["3d"]["all"]) == 1
+    assert list(scores["Car"]) == ["iou", "3d", "bev", "precision", "errors"] and len(scores["Car"]["3d"]["all"]) == 1
 
 
 def test_evaluate_scores_once_by_its_own_rules(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

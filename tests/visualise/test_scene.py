@@ -182,6 +182,7 @@ def test_the_script_computes_corners_hits_projections_and_points(tmp_path: Path)
 
 
 @needs_browser
+@pytest.mark.slow  # a browser's virtual clock can run ahead of its drawing on a busy machine
 def test_a_browser_draws_the_page_moves_the_slider_selects_a_box_and_steps_through_time(tmp_path: Path) -> None:
     points = torch.rand(4000, 4) * torch.tensor([60.0, 40, 2, 1]) - torch.tensor([0, 20.0, 2, 0])
     frame = Frame(points, "first")

@@ -47,14 +47,9 @@ def test_shipped_weights_compute_what_they_did(name: str) -> None:
 
 
 def record() -> None:
-    """Record the outputs of all shipped weights."""
-    from beambox.simulate import simulate_frame
-
-    points = simulate_frame(5, 900_002).camera_view().points
-    recorded = {
-        "xyz": (points[:, :3] / STEP).round().numpy().astype(np.int16),
-        "intensity": (points[:, 3] * 255).round().numpy().astype(np.uint8),
-    }
+    """Record the outputs of all shipped weights on the sweep that is there: simulated once, seed 5, frame 900002."""
+    with np.load(RECORDED) as stored:
+        recorded = {key: stored[key] for key in ("xyz", "intensity")}
     for name in sorted(shipped()):
         found = beambox.load(name, device="cpu", precision="float32")(frame_of(recorded))
         recorded[f"{name}:count"] = np.array(len(found))

@@ -13,8 +13,9 @@ Configuration and numbers are those of the public toolbox's configuration for ca
 whose outputs, of both stages, are reproduced in evaluation mode from its checkpoints.
 
 Deviations: features come from strides 2, 4 and 8 with one radius each, as in the toolbox (the paper's own code: strides
-4 and 8 with two radii each); proposals are not padded (on a GPU, with a mask); one limit of voxels holds in training and at
-test (the toolbox keeps 16000 in training). The voxel query's range is (z, y, x); for voxels of 0.1 m it is (2, 3, 3).
+4 and 8 with two radii each); proposals are not padded (on a GPU, with a mask); one limit of voxels holds in training
+and at test (the toolbox keeps 16000 in training). The voxel query's range is (z, y, x); for voxels of 0.1 m it is
+(2, 3, 3).
 """
 
 from __future__ import annotations

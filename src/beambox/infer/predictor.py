@@ -26,7 +26,7 @@ from beambox.infer.inputs import Sweep, read_sweep
 from beambox.infer.precision import choose_device, choose_precision
 from beambox.infer.streaming import Input, each_input, groups, names_one_sweep
 from beambox.infer.trained import Trained
-from beambox.structures import Batch, Detections, Frame
+from beambox.structures import Batch, Detections, Frame, expect_columns
 from beambox.zoo import shipped
 
 __all__ = ["Detector", "Input", "View", "find_weights", "load", "region"]
@@ -186,6 +186,8 @@ class Detector:
     def detect(self, frames: Sequence[Frame]) -> list[Detections]:
         """Detect in frames that pass through the network together; where there is no point, there is nothing."""
         survive_fork()
+        for frame in frames:
+            expect_columns(frame, self.config.columns)
         prepared = [self.prepare(frame) for frame in frames]
         seen = [k for k, frame in enumerate(prepared) if self.sees(frame)]
         found = [Detections.empty(self.classes, frame.id) for frame in frames]

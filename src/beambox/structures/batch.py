@@ -12,7 +12,7 @@ from beambox.checks import BeamboxError, expect_same_length
 from beambox.structures.frame import Frame
 from beambox.structures.labels import Labels
 
-__all__ = ["Batch"]
+__all__ = ["Batch", "expect_columns"]
 
 
 @dataclass(frozen=True)
@@ -55,4 +55,21 @@ class Batch:
         """Move the points to a device; labels stay where they are."""
         return replace(
             self, points=self.points.to(device, non_blocking=True), sample=self.sample.to(device, non_blocking=True)
+        )
+
+
+def expect_columns(frame: Frame, columns: int) -> None:
+    """Check that a sweep has the columns that a network reads of each point.
+
+    Args:
+        frame: the sweep.
+        columns: x, y, z, intensity and what else the network takes.
+
+    Raises:
+        BeamboxError: if it has fewer.
+    """
+    if frame.points.shape[1] < columns:
+        raise BeamboxError(
+            f"the network reads {columns} columns of each point, and sweep {frame.id} has {frame.points.shape[1]}: "
+            "name all of them where the file holds them (--fields x,y,z,intensity,...), or take other weights"
         )

@@ -76,4 +76,4 @@ def keep_older(folder: Path) -> Iterator[None]:
         draft.unlink(missing_ok=True)
         raise
     if kept:
-        os.replace(draft, folder / PREVIOUS)
+        draft.replace(folder / PREVIOUS)

@@ -114,10 +114,10 @@ def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, objec
     check_recipe(recipe, config, fabric.world_size)
     sources = [open_source(section, data) for section in recipe.data]
     joined = MixedSource(sources, tuple(s.weight for s in recipe.data if s.weight is not None) or None)
-    check_labels(joined, "training data", config.classes, config.grid, notes.append)
+    check_labels(joined, "training data", config.classes, config.grid, notes.append, config.columns)
     validation = open_source(recipe.validation.source, data) if recipe.validation else None
     if validation is not None:
-        check_labels(validation, "validation data", config.classes, config.grid, notes.append)
+        check_labels(validation, "validation data", config.classes, config.grid, notes.append, config.columns)
     database = None
     if recipe.augment and recipe.augment.sample:
         if fabric.global_rank == 0:

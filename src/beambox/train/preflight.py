@@ -13,6 +13,7 @@ from beambox.data.source import FrameSource
 from beambox.geometry.grid import VoxelGrid
 from beambox.infer.evaluate import check_classes
 from beambox.metrics.once import SUPERCLASS_OF
+from beambox.structures import expect_columns
 from beambox.train.config import Recipe, ValidationSection
 
 __all__ = ["check_labels", "check_recipe", "check_validation"]
@@ -68,7 +69,12 @@ def check_validation(section: ValidationSection, classes: Sequence[str]) -> None
 
 
 def check_labels(
-    source: FrameSource, what: str, classes: Sequence[str], grid: VoxelGrid, say: Callable[[str], None]
+    source: FrameSource,
+    what: str,
+    classes: Sequence[str],
+    grid: VoxelGrid,
+    say: Callable[[str], None],
+    columns: int = 4,
 ) -> None:
     """Look at the labels of some frames, spread over a source; at more while nothing in them can be learnt.
 
@@ -78,6 +84,7 @@ def check_labels(
         classes: of the detector.
         grid: region that the detector looks at.
         say: told of classes that the frames looked at lack.
+        columns: that the detector reads of each point.
 
     Raises:
         BeamboxError: if there is no frame, one has no labels, an object has no extent, or no object of the whole source
@@ -91,6 +98,7 @@ def check_labels(
     looked = 0
     for looked, index in enumerate(order.tolist(), 1):
         frame = source[index]
+        expect_columns(frame, columns)
         if frame.labels is None:
             raise BeamboxError(f"frame {frame.id} of the {what} has no labels, which the training needs")
         names.update(frame.labels.names)

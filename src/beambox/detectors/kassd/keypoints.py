@@ -193,7 +193,7 @@ class KeypointScores(nn.Module):
         for layer in hidden:
             bev = layer(bev)  # (B, width, Y, X)
         with torch.autocast(bev.device.type, enabled=False):  # scores are compared with each other: all their digits
-            return last(bev.to(last.weight.dtype))
+            return last(bev.to(next(last.parameters()).dtype))
 
     def score(
         self, maps: Tensor, grid: VoxelGrid, sample: Tensor, boxes: Tensor, classes: Tensor, anchors: Tensor

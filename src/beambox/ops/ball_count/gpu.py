@@ -1,7 +1,7 @@
 """How many voxels lie around each voxel, by counting the bits of columns, on a GPU (Triton); see ``cpu.py``."""
 
 # Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:
-# pyright: reportArgumentType=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false
 
 from __future__ import annotations
 

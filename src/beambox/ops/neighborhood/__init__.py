@@ -70,7 +70,6 @@ def neighborhood_attention(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, window
     expect_shape("bias", bias, (q.shape[1], 2 * window - 1, 2 * window - 1))
     if q.device.type == "cpu" and q.dtype in (torch.bfloat16, torch.float16):
         # The CPU has no fast version in half precision: float32 is a tenth of the reference's time, and more exact.
-        wide = (tensor.float() for tensor in (q, k, v, bias))
-        return neighborhood_attention(*wide, window).to(q.dtype)
+        return neighborhood_attention(q.float(), k.float(), v.float(), bias.float(), window).to(q.dtype)
     bias = bias.to(q.dtype)
     return choose("neighborhood_attention", BACKENDS, q, k, v, bias)(q, k, v, bias, window)

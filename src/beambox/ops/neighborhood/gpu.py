@@ -6,7 +6,7 @@ queries that saw a pixel.
 """
 
 # Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:
-# pyright: reportArgumentType=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ through the table and multiplies them with the offset's weights. Half precision 
 respect to the input are the same product along the inverse table; those of the weights are summed in a fixed number of
 stretches of output rows, which are then added in order. Results are the same from run to run.
 """
-# pyright: reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false
 
 from __future__ import annotations
 

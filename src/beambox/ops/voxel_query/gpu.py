@@ -1,5 +1,5 @@
 """Voxel query on a GPU (Triton): a program owns a block of points and walks the lines of cells around each."""
-# pyright: reportArgumentType=false, reportOperatorIssue=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false
 
 from __future__ import annotations
 
