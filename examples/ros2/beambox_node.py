@@ -2,8 +2,9 @@
 
     ros2 run ... or simply:  python beambox_node.py --ros-args -p model:=pointpillars-kitti -r points:=/velodyne_points
 
-Needs a sourced ROS 2 (rclpy, sensor_msgs, vision_msgs) and `pip install "beambox[track]"` in the same Python. Sweeps
-that arrive while one is worked on are dropped but for the newest (queue of one).
+Needs a sourced ROS 2 (rclpy, sensor_msgs, vision_msgs) and, in the same Python and from the checkout of beambox,
+`python -m pip install ".[track]"`. Sweeps that arrive while one is worked on are dropped but for the newest (queue of
+one).
 """
 
 from __future__ import annotations

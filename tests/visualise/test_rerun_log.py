@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 from beambox.structures import Detections, Frame, Labels
 from beambox.visualise.rerun_log import RerunLog
 from oracles.command_line import beambox
 from oracles.tiny_detector import street, tiny_weights
 
 ABSENT = importlib.util.find_spec("rerun") is None
-NEEDED = pytest.mark.skipif(ABSENT, reason='needs rerun-sdk: pip install "beambox[rerun]"')
+NEEDED = pytest.mark.skipif(ABSENT, reason=f"needs rerun-sdk: {how_to_install('rerun')}")
 
 
 @pytest.mark.skipif(not ABSENT, reason="rerun-sdk is installed")
 def test_without_the_package_the_extra_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     street().tofile(tmp_path / "scan.bin")
     ran = beambox(capsys, "view", tmp_path / "scan.bin", "--out", tmp_path / "a.rrd")
-    assert ran.status == 2 and 'pip install "beambox[rerun]"' in ran.err
+    assert ran.status == 2 and 'pip install ".[rerun]"' in ran.err
 
 
 def test_a_wrong_ending_is_refused_before_anything_else(tmp_path: Path) -> None:

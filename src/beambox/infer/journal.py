@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 from beambox.io import replacing
 from beambox.structures import Detections
 
@@ -138,7 +138,7 @@ def _pyarrow() -> tuple[Any, Any]:
         import pyarrow.parquet
     except ImportError:
         raise BeamboxError(
-            'Parquet files need the library pyarrow: pip install "beambox[parquet]", or write --format jsonl'
+            f"Parquet files need the library pyarrow: {how_to_install('parquet')}, or write --format jsonl"
         ) from None
     return pyarrow, pyarrow.parquet
 

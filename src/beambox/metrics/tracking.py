@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 
 __all__ = ["ClearScores", "HotaScores", "TrackingFrame", "amota", "assign", "clear_mot", "hota"]
 
@@ -236,5 +236,5 @@ def assign(gain: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     try:
         from scipy.optimize import linear_sum_assignment
     except ImportError:
-        raise BeamboxError('scoring tracks needs the library scipy: pip install "beambox[track]"') from None
+        raise BeamboxError(f"scoring tracks needs the library scipy: {how_to_install('track')}") from None
     return linear_sum_assignment(-gain)

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 from beambox.track.options import TrackerOptions
 
 __all__ = ["BoxFilter", "library"]
@@ -34,7 +34,7 @@ def library(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         raise BeamboxError(
-            f'tracking needs the library {name.split(".", maxsplit=1)[0]}: pip install "beambox[track]"'
+            f"tracking needs the library {name.split('.', maxsplit=1)[0]}: {how_to_install('track')}"
         ) from None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, how_to_install
 from beambox.io import replacing
 from beambox.structures import Detections, Frame, Labels
 from beambox.visualise.colours import TRUTH, class_colour, gradient
@@ -27,7 +27,7 @@ def import_rerun() -> Any:
     try:
         import rerun  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise BeamboxError('the viewer needs rerun-sdk, which is not installed: pip install "beambox[rerun]"') from None
+        raise BeamboxError(f"the viewer needs rerun-sdk, which is not installed: {how_to_install('rerun')}") from None
     return rerun
 
 
