@@ -75,11 +75,9 @@ def _names(before: Sequence[str]) -> list[str]:
 
         return list(shipped())
     if list(before) in (["train"], ["recipes"]):
-        from importlib.resources import files
+        from beambox.train.recipes import recipe_files
 
-        folder = files("beambox") / "recipes"
-        return sorted(one.name.removesuffix(".yaml") for place in folder.iterdir() if place.is_dir()
-                      for one in place.iterdir() if one.name.endswith(".yaml"))  # fmt: skip
+        return sorted(recipe_files())
     return []
 
 

@@ -14,6 +14,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
+from beambox.geometry.boxes import world_to_local
 from beambox.structures import Frame
 
 __all__ = ["BANDS", "RANGES", "Comparison", "Profile", "compare_objects", "object_profiles"]
@@ -44,12 +45,11 @@ class Profile:
 
 
 def _profile(name: str, box: np.ndarray, points: np.ndarray, least: int) -> Profile | None:
-    x, y, z, length, width, height, yaw = box
+    x, y, _, length, width, height, yaw = box
     near = points[np.abs(points[:, 0] - x) + np.abs(points[:, 1] - y) < length + width]
-    q = near[:, :3] - (x, y, z)
-    u = q[:, 0] * np.cos(yaw) + q[:, 1] * np.sin(yaw)
-    v = q[:, 1] * np.cos(yaw) - q[:, 0] * np.sin(yaw)
-    up = q[:, 2] + height / 2
+    local = world_to_local(torch.from_numpy(near[None, :, :3].astype(np.float64)), torch.from_numpy(box[None]))
+    u, v, w = local[0].numpy().T  # (N,) each
+    up = w + height / 2
     inside = (np.abs(u) < length / 2 + _MARGIN) & (np.abs(v) < width / 2 + _MARGIN)
     inside &= (up > _GROUND) & (up < height + _MARGIN)
     if inside.sum() < least:
@@ -58,7 +58,7 @@ def _profile(name: str, box: np.ndarray, points: np.ndarray, least: int) -> Prof
     facing = (yaw - np.arctan2(y, x) + np.pi) % (2 * np.pi) - np.pi
     view = "rear" if abs(facing) < np.pi / 6 else "front" if abs(facing) > np.pi * 5 / 6 else "side"
     extent = length / 2 * abs(np.cos(facing)) + width / 2 * abs(np.sin(facing))
-    nearness = -(q[inside, :2] @ (x, y)) / distance  # towards the sensor, from the box's center
+    nearness = -((near[inside, :2] - (x, y)) @ (x, y)) / distance  # towards the sensor, from the box's center
     share, intensity = up[inside] / height, near[inside, 3] if near.shape[1] > 3 else np.zeros(inside.sum())
     measures = (
         float(inside.sum()),

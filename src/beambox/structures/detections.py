@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
@@ -16,7 +16,7 @@ from beambox.geometry.boxes import corners_3d
 from beambox.geometry.calibration import Calibration
 from beambox.io import name_to_word
 from beambox.structures import conversions, rows
-from beambox.structures.selecting import Index, as_numbers, positions, same
+from beambox.structures.selecting import Index, as_numbers, positions, same_fields
 
 if TYPE_CHECKING:
     import numpy as np
@@ -127,7 +127,7 @@ class Detections:
         """Whether every field is equal, tensors value by value, wherever they lie."""
         if not isinstance(other, Detections):
             return NotImplemented
-        return all(same(getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
+        return same_fields(self, other)
 
     __hash__ = None  # pyright: ignore[reportAssignmentType]  # tensors can be changed in place
 

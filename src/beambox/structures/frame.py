@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
@@ -15,7 +15,7 @@ from beambox.geometry.calibration import Calibration
 from beambox.structures import conversions, rows
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
-from beambox.structures.selecting import Index, as_numbers, positions, same
+from beambox.structures.selecting import Index, as_numbers, positions, same_fields
 
 if TYPE_CHECKING:
     import numpy as np
@@ -121,7 +121,7 @@ class Frame:
         """Whether every field is equal, tensors value by value."""
         if not isinstance(other, Frame):
             return NotImplemented
-        return all(same(getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
+        return same_fields(self, other)
 
     __hash__ = None  # pyright: ignore[reportAssignmentType]  # tensors can be changed in place
 

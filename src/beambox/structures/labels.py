@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
@@ -14,7 +14,7 @@ from beambox.checks import BeamboxError, expect_finite, expect_same_length, expe
 from beambox.geometry.boxes import corners_3d
 from beambox.geometry.calibration import Calibration
 from beambox.structures import conversions, rows
-from beambox.structures.selecting import Index, as_numbers, positions, same
+from beambox.structures.selecting import Index, as_numbers, positions, same_fields
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,7 +63,7 @@ class ImageAttributes:
         """Whether every field is equal, value by value."""
         if not isinstance(other, ImageAttributes):
             return NotImplemented
-        return all(same(getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
+        return same_fields(self, other)
 
     __hash__ = None  # pyright: ignore[reportAssignmentType]  # tensors can be changed in place
 
@@ -150,7 +150,7 @@ class Labels:
         """Whether every field is equal, tensors value by value."""
         if not isinstance(other, Labels):
             return NotImplemented
-        return all(same(getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
+        return same_fields(self, other)
 
     __hash__ = None  # pyright: ignore[reportAssignmentType]  # tensors can be changed in place
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from typing import SupportsIndex
+from dataclasses import fields
+from typing import TYPE_CHECKING, SupportsIndex
 
 import numpy as np
 import torch
@@ -13,7 +14,10 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError
 
-__all__ = ["Index", "as_numbers", "positions", "same"]
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+__all__ = ["Index", "as_numbers", "positions", "same_fields"]
 
 Index = slice | Sequence[int] | Sequence[bool] | Tensor | NDArray[np.bool_] | NDArray[np.integer]
 """What selects several entries: a slice, a mask of the whole length, or positions."""
@@ -64,7 +68,12 @@ def _no_index(index: object) -> BeamboxError:
     return BeamboxError(f"an index is a number, a slice, a mask or a list of positions, got {index!r:.80}")
 
 
-def same(one: object, other: object) -> bool:
+def same_fields(one: DataclassInstance, other: DataclassInstance) -> bool:
+    """Whether every field of two values of one class is equal; tensors value by value, wherever they lie."""
+    return all(_same(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
+
+
+def _same(one: object, other: object) -> bool:
     """Whether two fields are equal; tensors by type, shape and every value, on whatever device."""
     if isinstance(one, Tensor) and isinstance(other, Tensor):
         return one.dtype == other.dtype and one.shape == other.shape and torch.equal(one.cpu(), other.cpu())

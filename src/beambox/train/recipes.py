@@ -9,7 +9,7 @@ import yaml
 
 from beambox.checks import MissingFileError, did_you_mean
 
-__all__ = ["AUDIENCES", "ShippedRecipe", "find_recipe", "list_recipes"]
+__all__ = ["AUDIENCES", "ShippedRecipe", "find_recipe", "list_recipes", "recipe_files"]
 
 FOLDER = Path(__file__).resolve().parents[1] / "recipes"
 
