@@ -48,7 +48,7 @@ class ClassResult:
     box3d: tuple[AveragePrecision, ...]
     """By 3-D IoU."""
     bev: tuple[AveragePrecision, ...]
-    """By the IoU seen from above."""
+    """By the IoU in BEV."""
     image: tuple[AveragePrecision, ...] = ()
     """By the IoU in the image; empty without a camera."""
     orientation: tuple[AveragePrecision, ...] = ()
@@ -139,7 +139,7 @@ class KittiResult:
 def _advice(graded: bool) -> list[str]:
     if not graded:
         return [
-            "every object counts, no difficulty levels; 3d and bev are IoU in 3-D and seen from above",
+            "every object counts, no difficulty levels; 3d and bev are IoU in 3-D and in BEV",
             "R40, R11: official 40 and 11 recalls; all: every recall, to be read where a class has few objects",
         ]
     return [
