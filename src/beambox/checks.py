@@ -37,7 +37,7 @@ LONGEST_WORD = 200
 
 
 LONGEST_MESSAGE = 1500
-"""Characters of an error's message; names in files may be of any length, and the middle of what quotes them is left out."""
+"""Characters of an error's message: names in files have any length, and the middle of what quotes them is left out."""
 
 
 class BeamboxError(ValueError):
