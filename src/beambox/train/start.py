@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from torch import nn
 
 from beambox.checks import BeamboxError
 from beambox.detectors.catalog import build, options_since, tensors_since
-from beambox.detectors.weights import WeightFile, read_weights
+from beambox.detectors.weights import WeightFile, read_weights, warn_of_licence
 from beambox.train.config import DetectorSection
 from beambox.zoo import find_weights
 
@@ -38,6 +39,7 @@ def build_detector(section: DetectorSection, seed: int) -> tuple[nn.Module, list
         raise BeamboxError(
             f"detector.start_from: {section.start_from} holds a {stored.detector}, the recipe trains a {section.name}"
         )
+    warn_of_licence(Path(section.start_from).stem, str(stored.card.get("licence", "")))
     base, changes = (options_since(section.name, options) for options in (stored.config, section.options))
     detector = _fresh(section.name, _over(base, changes), seed)
     return detector, take_over(detector, stored, section.start_from)
