@@ -15,7 +15,7 @@ from beambox.detectors.weights import load_weights, save_weights
 MODULE = """
 from dataclasses import dataclass
 from torch import nn
-from beambox.detectors.catalog import CatalogueEntry
+from beambox.detectors.catalog import CatalogEntry
 
 @dataclass(frozen=True)
 class ToyConfig:
@@ -27,7 +27,7 @@ class Toy(nn.Module):
         self.config = config
         self.layer = nn.Linear(config.width, 1)
 
-ENTRY = CatalogueEntry(ToyConfig, Toy)
+ENTRY = CatalogEntry(ToyConfig, Toy)
 """
 
 
@@ -60,5 +60,5 @@ def test_its_errors_are_ours(package: None) -> None:
         build("toy", {"widht": 3})
     with pytest.raises(BeamboxError, match=r'no detector is called "toi" \(did you mean "toy"\?\)'):
         build("toi")
-    with pytest.raises(BeamboxError, match=r'"broken".*toy_package:Toy.* must be a .*CatalogueEntry, got type'):
+    with pytest.raises(BeamboxError, match=r'"broken".*toy_package:Toy.* must be a .*CatalogEntry, got type'):
         build("broken")

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from beambox import __version__
 from beambox.checks import BeamboxError, how_to_install
 from beambox.detectors.catalog import config_to_dict, name_of
+from beambox.detectors.contract import AnyModel
 from beambox.detectors.hcnet import HCNet
 from beambox.detectors.pointpillars import PointPillars
 from beambox.export.onnx_check import TOLERANCE, Differences, compare, runtime_is_there, synthetic_sweep
@@ -82,7 +83,7 @@ class DenseGraph(nn.Module):
 
 
 def export_onnx(
-    model: nn.Module,
+    model: AnyModel,
     path: str | Path,
     *,
     grid: VoxelGrid | None = None,
@@ -131,7 +132,7 @@ def export_onnx(
     return Written(path, len(content), shapes(proto.graph.input), shapes(proto.graph.output), tuple(checks))
 
 
-def exportable(model: nn.Module) -> PointPillars | HCNet:
+def exportable(model: AnyModel) -> PointPillars | HCNet:
     """Return a float32 copy on the CPU, in evaluation mode; refuse what ONNX has no operators for."""
     if not isinstance(model, PointPillars | HCNet):
         raise BeamboxError(
