@@ -34,7 +34,7 @@ def pip(*words: str) -> None:
     run("-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", str(CONSTRAINTS), *words)
 
 
-def setup(extras: str = "train,formats", marker: str = ".ready") -> None:
+def setup(extras: str = "train,formats,plots", marker: str = ".ready") -> None:
     """Make the environment and install this checkout into it; does nothing where both are up to date."""
     done = VENV / marker
     inputs = (HERE / "pyproject.toml", CONSTRAINTS)

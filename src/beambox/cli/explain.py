@@ -33,8 +33,10 @@ def command(  # each is an option of the command line
     HCNet: the weights of height slices and channels. KASSD: the weights of places and the scores of keypoints. DenNet:
     the densities of voxels, and what the surest boxes attend to.
     """
+    from beambox.checks import expect_library
     from beambox.data.existence import expect_inputs
 
+    expect_library("matplotlib", "plots", "drawing what a detector weighs")
     expect_inputs(inputs)
 
     from beambox.explain.pictures import explain
