@@ -17,8 +17,8 @@ import beambox
 from beambox.data.kitti import KittiSource
 from beambox.simulate import SimulatedSource
 from beambox.structures import Frame
-from beambox.visualise.bev import Region
-from beambox.visualise.picture import draw_sweep
+from beambox.visualize.bev import Region
+from beambox.visualize.picture import draw_sweep
 
 WIDTH = 680
 """Pixels of a picture."""

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from beambox.cli.commands import COMMANDS
-from beambox.detectors.catalogue import CATALOGUE, config_to_dict
+from beambox.detectors.catalog import CATALOG, config_to_dict
 from beambox.train.config import Recipe
 from oracles.paths import ROOT
 
@@ -22,7 +22,7 @@ FULL = Recipe.model_validate(
         "validation": {"source": {"kind": "kitti"}},
     }
 ).model_dump(mode="json")
-OPTIONS = {name: config_to_dict(entry.config()) for name, entry in CATALOGUE.items()}
+OPTIONS = {name: config_to_dict(entry.config()) for name, entry in CATALOG.items()}
 
 
 def column(title: str, position: int) -> list[str]:

@@ -15,7 +15,7 @@ import torch
 
 import beambox
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import CATALOGUE
+from beambox.detectors.catalog import CATALOG
 from beambox.infer.inputs import find_sweeps
 from oracles import pages
 from oracles.paths import ROOT
@@ -33,7 +33,7 @@ def words(changes: dict[str, object]) -> list[str]:
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Give a function that installs the files of a page of docs/, as pip would, and returns their folder."""
     before = set(sys.modules)
-    names = set(CATALOGUE)
+    names = set(CATALOG)
 
     def install_page(page: str) -> Path:
         folder = tmp_path / "package"
@@ -55,8 +55,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     for module in set(sys.modules) - before:
         if module in ("heightmap", "xyz_for_beambox"):
             del sys.modules[module]
-    for name in set(CATALOGUE) - names:
-        del CATALOGUE[name]
+    for name in set(CATALOG) - names:
+        del CATALOG[name]
 
 
 def test_the_detector_of_the_page_trains_scores_and_detects(install: Install, tmp_path: Path) -> None:
@@ -78,8 +78,13 @@ def test_weights_of_an_absent_package_say_so(install: Install, tmp_path: Path) -
     folder = install("add_detector.md")
     run = tmp_path / "run"
     options = {"detector.options.grid": OPTIONS["grid"], "window": None, "workers": 0, "validation": None}
-    beambox.train(folder / "heightmap.yaml", tiny_kitti(tmp_path / "kitti"), run, overrides=words({**options, "optim.iterations": 1}))
-    CATALOGUE.pop("heightmap")
+    beambox.train(
+        folder / "heightmap.yaml",
+        tiny_kitti(tmp_path / "kitti"),
+        run,
+        overrides=words({**options, "optim.iterations": 1}),
+    )
+    CATALOG.pop("heightmap")
     sys.path.remove(str(folder))
     with pytest.raises(BeamboxError, match='no detector is called "heightmap"'):
         beambox.load(run)
