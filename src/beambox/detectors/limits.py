@@ -25,8 +25,8 @@ MAY_BE_ZERO = {
     "n",
     "query_range",
     "train_least",
-}  # d, e, m, n: KASSD's keypoints
-"""Counts that may be 0; all others are at least 1."""
+}
+"""Counts that may be 0 (d, e, m, n: KASSD's keypoints); all others are at least 1."""
 MAY_BE_NEGATIVE = {"bottom_z", "maximum", "minimum"}
 """Numbers that may lie below 0: places in space."""
 ABOVE_ZERO = {"radii", "radius", "size", "smooth_l1_beta"}

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, expect_library
 from beambox.detectors.dennet import DenNet, NeighborhoodAttention
 from beambox.detectors.hcnet import HCNet, pillar_stacks
 from beambox.detectors.kassd.keypoints import map_coordinates, sample_bilinear
@@ -41,6 +41,7 @@ def explain(detector: Detector, frame: Frame, score_threshold: float = 0.3) -> l
     Raises:
         BeamboxError: for another detector, or a sweep with no point where it looks.
     """
+    expect_library("matplotlib", "plots", "drawing what a detector weighs")
     model = detector.model
     if not isinstance(model, HCNet | KASSD | DenNet):
         raise BeamboxError(f"{type(model).__name__} has no attention to draw; HCNet, KASSD and DenNet have")
