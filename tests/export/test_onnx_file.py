@@ -305,7 +305,9 @@ def test_a_file_that_differs_is_not_written_and_the_old_one_stays(no_tracing: Ex
 
 def test_a_missing_package_is_told_with_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_file, "find_spec", lambda name: None)
-    with pytest.raises(BeamboxError, match=r'needs onnx and onnxscript: python -m pip install "\.\[export\]"'):
+    with pytest.raises(
+        BeamboxError, match=r'needs the library onnx, which is not installed: python -m pip install "\.\[export\]"'
+    ):
         export_onnx(build_small("pointpillars"), tmp_path / "m.onnx")
 
 
@@ -315,7 +317,10 @@ def test_without_onnxruntime_the_file_is_written_unless_a_sweep_is_given(
     monkeypatch.setattr(onnx_file, "runtime_is_there", lambda: False)
     written: Written = export_onnx(no_tracing.model, tmp_path / "m.onnx")
     assert written.checks == () and written.path.is_file()
-    with pytest.raises(BeamboxError, match=r'comparing needs onnxruntime: python -m pip install "\.\[export\]"'):
+    with pytest.raises(
+        BeamboxError,
+        match=r'comparing needs the library onnxruntime, which is not installed: python -m pip install "\.\[export\]"',
+    ):
         export_onnx(no_tracing.model, tmp_path / "n.onnx", sweeps={"s": torch.zeros(1, 4)})
     assert not (tmp_path / "n.onnx").exists()
 

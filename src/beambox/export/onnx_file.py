@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from beambox import __version__
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, lacking
 from beambox.detectors.catalog import config_to_dict, name_of
 from beambox.detectors.contract import AnyModel
 from beambox.detectors.hcnet import HCNet
@@ -36,7 +36,6 @@ __all__ = ["OPSETS", "DenseGraph", "Written", "export_onnx"]
 OPSETS = range(18, 24)
 """Versions of ONNX's operators that can be asked for; before 18 there is no maximum over groups."""
 FORMAT = "beambox-onnx-1"
-INSTALL = how_to_install("export")
 
 
 @dataclass(frozen=True)
@@ -111,11 +110,11 @@ def export_onnx(
         raise BeamboxError(f"the file to write must end in .onnx, got {path}")
     if opset not in OPSETS:
         raise BeamboxError(f"`opset` must lie in {OPSETS[0]} .. {OPSETS[-1]}, got {opset}")
-    missing = [name for name in ("onnx", "onnxscript") if find_spec(name) is None]
-    if missing:
-        raise BeamboxError(f"exporting needs {' and '.join(missing)}: {INSTALL}")
+    for name in ("onnx", "onnxscript"):
+        if find_spec(name) is None:
+            raise lacking(name, "export", "exporting")
     if sweeps and not runtime_is_there():
-        raise BeamboxError(f"comparing needs onnxruntime: {INSTALL}")
+        raise lacking("onnxruntime", "export", "comparing")
     proto = traced(DenseGraph(detector, grid or detector.config.grid).eval(), opset)
     about = json.dumps(described(detector, grid or detector.config.grid, card or {}), sort_keys=True)
     proto.metadata_props.add(key="beambox", value=about)

@@ -11,7 +11,7 @@ from io import StringIO
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from beambox import io
-from beambox.checks import BeamboxError, printable
+from beambox.checks import BeamboxError, import_library, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -125,11 +125,7 @@ def frame_of_array(array: np.ndarray, columns: Sequence[str]) -> pandas.DataFram
 
 
 def _pandas() -> Any:
-    try:
-        import pandas  # pyright: ignore[reportMissingTypeStubs]
-    except ImportError:
-        raise BeamboxError("tables need pandas, which is not installed: pip install pandas") from None
-    return pandas
+    return import_library("pandas", "tables", "a table")
 
 
 def counted(names: Sequence[str]) -> str:
