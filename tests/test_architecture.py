@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "explain": {"infer", "detectors", "layers", "ops", "structures", "visualise", "geometry"},
     "report": {"infer", "data", "metrics", "visualise", "structures", "geometry", "ops"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
+    "serve": {"infer", "data", "structures", "geometry"},
     "stream": {"track", "infer", "data", "structures", "geometry"},
     "track": {"infer", "data", "metrics", "structures", "geometry", "ops"},
     "zoo": set(),

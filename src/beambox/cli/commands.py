@@ -13,6 +13,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
     "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
     "stream": ("beambox.cli.stream:command", "detect and track through a recording; boxes as a recording"),
+    "serve": ("beambox.cli.serve:command", "detect over HTTP: POST a sweep, get JSON"),
     "track": ("beambox.cli.track:command", "follow objects through a drive: identities, velocities"),
     "view": ("beambox.cli.view:command", "sweeps, boxes and cameras in the rerun viewer, live or as a file"),
     "explain": ("beambox.cli.explain:command", "what the attention of HCNet, KASSD or DenNet looks at, as pictures"),
