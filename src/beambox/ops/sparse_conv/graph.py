@@ -1,8 +1,8 @@
 """Sparse convolution for a graph that is being exported: gathers, matrix products, and binary search in sorted keys.
 
 Operators of ONNX alone, sizes known no earlier than values. The sites of a strided convolution are read from a map of
-its output, one byte a cell; kernel maps are found by a binary search with a fixed number of steps, so that nothing
-loops over data. Nothing is scattered but single elements, each to a place of its own.
+its output, one byte a cell. Kernel maps are looked up in a map of rows, or, where a level has too many cells, found by
+a binary search with a fixed number of steps. Nothing is scattered but single elements, each to a place of its own.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from beambox.geometry.constants import constant
 from beambox.ops.sparse_conv.pairs import input_rows
 from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple
 
-__all__ = ["MOST_SITES", "convolve", "find_targets", "indices_of", "neighbour_table", "to_bev"]
+__all__ = ["MAP_CELLS", "MOST_SITES", "convolve", "find_targets", "indices_of", "neighbour_table", "to_bev"]
 
+MAP_CELLS = 1 << 24
+"""Cells of a level up to which rows are looked up in a map of it, four bytes a cell; beyond, keys are searched."""
 MOST_SITES = 1 << 21
 """Sites of a level that the search can tell apart; a sweep has some ten thousand."""
 
@@ -51,21 +53,30 @@ def find_targets(source: Sites, geometry: Geometry) -> Tensor:
 def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
     """Find the input row that reaches each output through each kernel offset: ``(V_out, K)`` int64, -1 for none."""
     nz, ny, nx = source.shape
-    steps = min(MOST_SITES, source.batch_size * nz * ny * nx).bit_length()
     device = source.sorted_keys.device
-    keys = torch.cat((source.sorted_keys, source.sorted_keys.new_full((1,), torch.iinfo(torch.int64).max)))
-    order = torch.cat((source.order, source.order.new_full((1,), -1)))  # the search may end behind the last one
     stride, extent = constant(geometry.stride, device), constant(source.shape, device)
     place = target.indices[:, None, 1:] * stride + geometry.offset_table(device)  # (V_out, K, 3)
     inside = ((place >= 0) & (place < extent)).all(dim=2)
     line = (target.indices[:, :1] * nz + place[..., 0]) * ny + place[..., 1]
     wanted = line * nx + place[..., 2]  # (V_out, K)
+    cells = source.batch_size * nz * ny * nx
+    if cells <= MAP_CELLS:
+        rows = torch.full((cells,), -1, dtype=torch.int32, device=device)
+        rows = rows.scatter(0, source.sorted_keys, source.order.int())
+        return torch.where(inside, rows[torch.where(inside, wanted, 0)].long(), -1)
+    return torch.where(inside, search(source, wanted, geometry, min(MOST_SITES, cells).bit_length()), -1)
+
+
+def search(source: Sites, wanted: Tensor, geometry: Geometry, steps: int) -> Tensor:
+    """Find the row of each wanted key ``(V_out, K)``, -1 for none, by one binary search per row of the kernel."""
+    keys = torch.cat((source.sorted_keys, source.sorted_keys.new_full((1,), torch.iinfo(torch.int64).max)))
+    order = torch.cat((source.order, source.order.new_full((1,), -1)))  # the search may end behind the last one
     width = geometry.kernel[2] if geometry.dilation[2] == 1 else 1
     row = lower_bound(keys, wanted[:, ::width], steps)  # (V_out, K / width) of the first of each row of the kernel
     columns = []
     for k in range(width):
         found = keys[row] == wanted[:, k::width]
-        columns.append(torch.where(found & inside[:, k::width], order[row], -1))
+        columns.append(torch.where(found, order[row], -1))
         row = row + found.long()  # the lower bound of the next cell
     return torch.stack(columns, dim=2).flatten(1)
 
