@@ -27,6 +27,7 @@ from beambox.serve.batching import Batcher
 from beambox.serve.bodies import unpacked_size
 from beambox.serve.limits import ServeLimits
 from beambox.structures import Detections, Frame
+from oracles.same_boxes import expect_same_boxes
 from oracles.tiny_detector import street, tiny_model
 
 LIMITS = ServeLimits(max_bytes=400_000, max_points=20_000, max_unpacked=2_000_000, body_seconds=0.3)
@@ -53,17 +54,6 @@ def served(
     asyncio.run(run())
 
 
-def expect_same(found: Detections, wanted: Detections) -> None:
-    """Sweep by sweep and in batches sums differ in the last digits, which may swap two boxes of nearly equal score."""
-    assert len(found) == len(wanted) > 5
-    np.testing.assert_allclose(found.scores, wanted.scores, atol=2e-3)
-    apart = (found.boxes[:, None] - wanted.boxes).abs().amax(dim=2)  # (N, N)
-    assert apart.min(dim=1).values.max() < 2e-3
-    nearest = apart.argmin(dim=1)
-    assert sorted(nearest.tolist()) == list(range(len(wanted)))
-    assert found.names == [wanted.names[k] for k in nearest.tolist()]
-
-
 # --- good requests ----------------------------------------------------------------------------------------------------
 
 
@@ -83,7 +73,7 @@ def test_every_format_gives_what_detecting_in_the_array_gives(detector: Detector
             for answer in (asked, by_type, guessed):
                 assert answer.status_code == 200 and answer.headers["content-type"] == "application/json", answer.text
                 found = Detections.from_json(answer.text)
-                expect_same(found, wanted)
+                expect_same_boxes(found, wanted, 2e-4)
             assert asked.json()["frame"] == "000007" and asked.json()["model"] == "tiny"
 
     served(detector, talk)
@@ -153,7 +143,7 @@ def test_requests_of_one_moment_go_through_together_and_each_gets_its_own_answer
         answers = await asyncio.gather(*posts)
         for k, answer in enumerate(answers):
             assert answer.json()["frame"] == f"s{k}"
-            expect_same(Detections.from_json(answer.text), wanted[k])
+            expect_same_boxes(Detections.from_json(answer.text), wanted[k], 2e-3)
         assert service.batcher.frames == 6 and service.batcher.batches <= 3
 
     served(detector, talk, batch_size=4, batch_wait=2.0)

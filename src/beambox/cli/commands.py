@@ -28,7 +28,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "data": ("beambox.cli.data:app", "check a data set of one's own before training, and propose anchors for it"),
     "bench": ("beambox.cli.bench:command", "latency stage by stage, throughput, peak memory"),
     "submit": ("beambox.cli.submit:command", "check result files for KITTI's test server and pack them"),
-    "export": ("beambox.cli.export:command", "write PointPillars or HCNet as an ONNX file, compared with PyTorch"),
+    "export": ("beambox.cli.export:command", "write a detector as an ONNX file, compared with PyTorch"),
     "completion": ("beambox.cli.completion:command", "a script that completes commands and options in a shell"),
     "import-openpcdet": ("beambox.cli.import_openpcdet:command", "convert a checkpoint of OpenPCDet"),
     "score": ("beambox.cli.score:app", "score result files of any detector by the rules of KITTI or ONCE"),
