@@ -5,7 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from beambox.ops.sparse_conv import Geometry, KernelMap, Sites, SparseTensor, graph, reference
+from beambox.ops.sparse_conv import (
+    Geometry,
+    KernelMap,
+    Sites,
+    SparseTensor,
+    graph,
+    graph_indices,
+    graph_maps,
+    reference,
+)
 
 GEOMETRIES = {
     "submanifold": Geometry.centred((3, 3, 3)),
@@ -32,15 +41,15 @@ def scattered(shape: tuple[int, int, int], count: int, seed: int) -> Sites:
 def test_tables_sites_and_sums_are_those_of_the_reference(
     name: str, count: int, most_in_map: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(graph, "MAP_CELLS", most_in_map)
+    monkeypatch.setattr(graph_maps, "MAP_CELLS", most_in_map)
     geometry, sites = GEOMETRIES[name], scattered((7, 10, 9), count, seed=count)
     target = sites
     if not geometry.submanifold:
-        keys = graph.find_targets(sites, geometry)
+        keys = graph_maps.find_targets(sites, geometry)
         assert torch.equal(keys, reference.find_targets(sites, geometry))
         target = Sites.from_keys(keys, geometry.output_shape(sites.shape), 2)
     wanted = reference.neighbour_table(sites, target, geometry)
-    assert torch.equal(graph.neighbour_table(sites, target, geometry).int(), wanted)
+    assert torch.equal(graph_maps.neighbour_table(sites, target, geometry).int(), wanted)
     pairs = KernelMap(sites, target, geometry)
     features, weight = torch.randn(len(sites), 5), torch.randn(geometry.offsets, 5, 3)
     for bias in (None, torch.randn(3)):
@@ -52,11 +61,13 @@ def test_tables_sites_and_sums_are_those_of_the_reference(
 def test_indices_and_maps_are_those_of_a_sparse_tensor() -> None:
     sites = scattered((3, 5, 4), 40, seed=1)
     features = torch.randn(len(sites), 6)
-    assert torch.equal(graph.indices_of(sites.sorted_keys, sites.order, sites.shape), sites.indices)
-    assert torch.equal(graph.to_bev(features, sites), SparseTensor(features, sites).to_bev())
+    assert torch.equal(graph_indices.indices_of(sites.sorted_keys, sites.order, sites.shape), sites.indices)
+    assert torch.equal(
+        graph_indices.to_bev(features, sites.indices, sites.shape, 2), SparseTensor(features, sites).to_bev()
+    )
 
 
 def test_the_search_counts_the_keys_below() -> None:
     keys = torch.tensor([3, 4, 9, 70, torch.iinfo(torch.int64).max])
     wanted = torch.tensor([[-5, 0, 3], [4, 5, 9], [10, 70, 71]])
-    assert graph.lower_bound(keys, wanted, 7).tolist() == [[0, 0, 0], [1, 2, 2], [3, 3, 4]]
+    assert graph_maps.lower_bound(keys, wanted, 7).tolist() == [[0, 0, 0], [1, 2, 2], [3, 3, 4]]

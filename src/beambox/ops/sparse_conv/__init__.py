@@ -83,7 +83,7 @@ def _graph() -> Callable[..., Tensor]:
 
 
 def _graph_targets() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.graph import find_targets
+    from beambox.ops.sparse_conv.graph_maps import find_targets
 
     return find_targets
 

@@ -26,7 +26,7 @@ def _triton_inverse() -> Callable[..., Tensor]:
 
 
 def _graph_table() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.graph import neighbour_table
+    from beambox.ops.sparse_conv.graph_maps import neighbour_table
 
     return neighbour_table
 

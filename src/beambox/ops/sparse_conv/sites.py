@@ -88,7 +88,7 @@ def _triton_indices() -> Callable[..., Tensor]:
 
 
 def _graph_indices() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.graph import indices_of
+    from beambox.ops.sparse_conv.graph_indices import indices_of
 
     return indices_of
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError
 from beambox.ops.dispatch import exporting
+from beambox.ops.sparse_conv import graph_indices
 from beambox.ops.sparse_conv.sites import Sites, Triple
 
 __all__ = ["SparseTensor"]
@@ -86,9 +87,7 @@ class SparseTensor:
     def to_bev(self) -> Tensor:
         """Stack the height levels into channels: ``(B, C * Z, Y, X)``, channel ``c * Z + z`` (VoxelNet, 2.1.3)."""
         if exporting():
-            from beambox.ops.sparse_conv.graph import to_bev
-
-            return to_bev(self.features, self.sites)
+            return graph_indices.to_bev(self.features, self.indices, self.shape, self.batch_size)
         z, y, x = self.shape
         b, level, row, column = self.indices.unbind(dim=1)
         bev = self.features.new_zeros((self.batch_size, y, x, self.channels, z))
