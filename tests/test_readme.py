@@ -86,14 +86,14 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Stand in a folder with the sweeps that the README names; every shipped name gives small weights."""
     weights = tiny_weights(tmp_path)
 
-    class Shelf(dict):
+    class AnyShipped(dict):
         def __contains__(self, name: object) -> bool:
             return True
 
         def __missing__(self, name: str) -> Path:
             return weights
 
-    monkeypatch.setattr("beambox.infer.predictor.shipped", Shelf)
+    monkeypatch.setattr("beambox.zoo.shipped", AnyShipped)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scans").mkdir()
     for name in ("scan.bin", "scans/a.bin", "scans/b.bin"):

@@ -91,8 +91,8 @@ def expect_finite(name: str, tensor: Tensor) -> None:
 def expect_same_length(**lengths: int) -> None:
     """Check that several sequences, given as ``name=len(sequence)``, have one length."""
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"`{name}` has {n}" for name, n in lengths.items())
-        raise BeamboxError(f"these must have the same length: {told}")
+        details = ", ".join(f"`{name}` has {n}" for name, n in lengths.items())
+        raise BeamboxError(f"these must have the same length: {details}")
 
 
 E = TypeVar("E", bound=Enum)

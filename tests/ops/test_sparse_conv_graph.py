@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from beambox.ops.sparse_conv import (
-    Geometry,
+    ConvSpec,
     KernelMap,
     Sites,
     SparseTensor,
@@ -16,13 +16,13 @@ from beambox.ops.sparse_conv import (
     reference,
 )
 
-GEOMETRIES = {
-    "submanifold": Geometry.centred((3, 3, 3)),
-    "wide": Geometry.centred((3, 5, 1)),
-    "dilated": Geometry.centred((3, 3, 3), (1, 1, 2)),
-    "halving": Geometry((3, 3, 3), (2, 2, 2), (1, 1, 1)),
-    "halving without padding above": Geometry((3, 3, 3), (2, 2, 2), (0, 1, 1)),
-    "height": Geometry((3, 1, 1), (2, 1, 1)),
+SPECS = {
+    "submanifold": ConvSpec.centered((3, 3, 3)),
+    "wide": ConvSpec.centered((3, 5, 1)),
+    "dilated": ConvSpec.centered((3, 3, 3), (1, 1, 2)),
+    "halving": ConvSpec((3, 3, 3), (2, 2, 2), (1, 1, 1)),
+    "halving without padding above": ConvSpec((3, 3, 3), (2, 2, 2), (0, 1, 1)),
+    "height": ConvSpec((3, 1, 1), (2, 1, 1)),
 }
 
 
@@ -36,22 +36,22 @@ def scattered(shape: tuple[int, int, int], count: int, seed: int) -> Sites:
 
 
 @pytest.mark.parametrize("most_in_map", [0, 1 << 24], ids=["searched", "looked up"])
-@pytest.mark.parametrize("name", GEOMETRIES)
+@pytest.mark.parametrize("name", SPECS)
 @pytest.mark.parametrize("count", [1, 2, 300])
 def test_tables_sites_and_sums_are_those_of_the_reference(
     name: str, count: int, most_in_map: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(graph_maps, "MAP_CELLS", most_in_map)
-    geometry, sites = GEOMETRIES[name], scattered((7, 10, 9), count, seed=count)
+    spec, sites = SPECS[name], scattered((7, 10, 9), count, seed=count)
     target = sites
-    if not geometry.submanifold:
-        keys = graph_maps.find_targets(sites, geometry)
-        assert torch.equal(keys, reference.find_targets(sites, geometry))
-        target = Sites.from_keys(keys, geometry.output_shape(sites.shape), 2)
-    wanted = reference.neighbour_table(sites, target, geometry)
-    assert torch.equal(graph_maps.neighbour_table(sites, target, geometry).int(), wanted)
-    pairs = KernelMap(sites, target, geometry)
-    features, weight = torch.randn(len(sites), 5), torch.randn(geometry.offsets, 5, 3)
+    if not spec.submanifold:
+        keys = graph_maps.find_targets(sites, spec)
+        assert torch.equal(keys, reference.find_targets(sites, spec))
+        target = Sites.from_keys(keys, spec.output_shape(sites.shape), 2)
+    wanted = reference.neighbor_table(sites, target, spec)
+    assert torch.equal(graph_maps.neighbor_table(sites, target, spec).int(), wanted)
+    pairs = KernelMap(sites, target, spec)
+    features, weight = torch.randn(len(sites), 5), torch.randn(spec.offsets, 5, 3)
     for bias in (None, torch.randn(3)):
         torch.testing.assert_close(
             graph.convolve(features, weight, bias, pairs), reference.convolve(features, weight, bias, pairs)

@@ -90,16 +90,16 @@ def test_options_of_the_query(detector: Detector) -> None:
     wide = np.concatenate((SWEEP, np.ones((len(SWEEP), 1), np.float32)), axis=1)
 
     async def talk(client: Any, _: Any) -> None:
-        least = await client.post("/detect?min_score=0.5", content=SWEEP.tobytes())
+        least = await client.post("/detect?score_threshold=0.5", content=SWEEP.tobytes())
         scores = [row["score"] for row in least.json()["detections"]]
         assert scores and min(scores) >= 0.5
-        five = await client.post("/detect?fields=x,y,z,intensity,ring&min_score=0.5", content=wide.tobytes())
+        five = await client.post("/detect?fields=x,y,z,intensity,ring&score_threshold=0.5", content=wide.tobytes())
         assert five.json()["detections"] == least.json()["detections"]
         refused = await client.post("/detect", content=wide.tobytes())
         assert refused.status_code == 400 and "looks like points of 5 float32" in refused.json()["error"]
         for query, words in {
-            "min_score=nan": "from 0 to 1", "min_score=2": "from 0 to 1", "min_score=": "from 0 to 1",
-            "minscore=1": "did you mean", "format=exe": "must be one of bin, npy", "frame=../a": "separator of folders",
+            "score_threshold=nan": "from 0 to 1", "score_threshold=2": "from 0 to 1", "score_threshold=": "from 0 to 1",
+            "score_treshold=1": "did you mean", "format=exe": "must be one of bin, npy", "frame=../a": "separator of folders",
             "fields=a,b": "must name x, y and z", "frame=" + "a" * 401: "401 characters",
         }.items():  # fmt: skip
             answer = await client.post(f"/detect?{query}", content=SWEEP.tobytes())
@@ -356,7 +356,7 @@ def test_a_thousand_hostile_requests_change_nothing(detector: Detector) -> None:
         if rng.random() < 0.5:
             query["format"] = rng.choice(["bin", "npy", "npz", "pcd", "ply", "las", "laz", *TRICKS])
         if rng.random() < 0.2:
-            query[rng.choice(["frame", "fields", "min_score", *TRICKS[:3]])] = rng.choice(TRICKS)
+            query[rng.choice(["frame", "fields", "score_threshold", *TRICKS[:3]])] = rng.choice(TRICKS)
         headers = {"content-type": rng.choice(TYPES)} if rng.random() < 0.5 else {}
         body: Any = mutated(rng, good)
         path = rng.choice(PATHS) if rng.random() < 0.2 else "/detect"

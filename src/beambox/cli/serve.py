@@ -10,7 +10,7 @@ import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
-from beambox.cli.console import announce, say, show_log
+from beambox.cli.console import announce, log, show_log
 
 __all__ = ["command"]
 
@@ -51,7 +51,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
 
     Examples:
       beambox serve --model pointpillars-kitti
-      curl --data-binary @scan.bin "http://127.0.0.1:8080/detect?min_score=0.3"
+      curl --data-binary @scan.bin "http://127.0.0.1:8080/detect?score_threshold=0.3"
       curl --data-binary @scan.pcd "http://127.0.0.1:8080/detect?format=pcd&frame=000123"
       curl http://127.0.0.1:8080/model
 
@@ -75,7 +75,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         from beambox.zoo import DEFAULT
 
         model = DEFAULT
-        say(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
+        log(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
 
     from beambox.infer.predictor import load
 
@@ -135,4 +135,4 @@ def run(app: object, listening: socket.socket, connections: int) -> None:
         uvicorn.Server(config).run(sockets=[listening])
     except KeyboardInterrupt:  # uvicorn hands the signal on once all is closed
         pass
-    say("stopped")
+    log("stopped")

@@ -4,11 +4,11 @@
 
     ROOT/
       points/NAME.bin  (.npy .npz .pcd .ply .las .laz)
-      labels/NAME.txt          a line an object: class x y z l w h yaw  (metres, radians; # begins a comment);
+      labels/NAME.txt          a line per object: class x y z l w h yaw  (metres, radians; # begins a comment);
                                x y z l w h yaw class, as OpenPCDet's custom data have it, is read as well
       ImageSets/train.txt      optional lists of names; where absent, every sweep
 
-x, y, z is the box's geometric centre; yaw grows counter-clockwise seen from above, 0 along +x. Further columns of a
+x, y, z is the box's geometric centre; yaw grows counter-clockwise in BEV, 0 along +x. Further columns of a
 label line are ignored. Other layouts, axes and classes are described by a YAML file: :mod:`beambox.data.custom`.
 """
 
@@ -23,7 +23,7 @@ import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.box_files import box_words
-from beambox.data.reading import SUFFIXES, read_frame
+from beambox.data.read_points import SUFFIXES, read_frame
 from beambox.io import name_to_word, read_names, read_text
 from beambox.structures import Frame, Labels
 
@@ -50,8 +50,8 @@ class FolderSource:
             split: name of a list in ImageSets/; "all" is every sweep.
             points: name of the folder of sweeps.
             labels: name of the folder of labels; a sweep without a file there has no labels.
-            fields: see :func:`beambox.data.reading.read_frame`.
-            intensity_scale: see :func:`beambox.data.reading.read_frame`; give it where sweeps of one sensor are of
+            fields: see :func:`beambox.data.read_points.read_frame`.
+            intensity_scale: see :func:`beambox.data.read_points.read_frame`; give it where sweeps of one sensor are of
                 different brightness, so that all are scaled alike.
 
         Raises:

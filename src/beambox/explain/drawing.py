@@ -1,4 +1,4 @@
-"""Maps seen from above as pictures: x forward is up, y left is left, in metres."""
+"""Maps in BEV as pictures: x forward is up, y left is left, in metres."""
 
 from __future__ import annotations
 

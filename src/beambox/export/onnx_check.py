@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, MissingFileError, how_to_install
-from beambox.detectors.kassd import KamScore, KassdPredictions
+from beambox.detectors.kassd import KamScore, KASSDPredictions
 from beambox.geometry.boxes import wrap_angle
 from beambox.geometry.grid import VoxelGrid
 from beambox.io import parse_json
@@ -72,7 +72,7 @@ def runtime_is_there() -> bool:
     return find_spec("onnxruntime") is not None
 
 
-def outputs_of(config: Any, predictions: AnchorPredictions | KassdPredictions) -> tuple[Tensor, Tensor]:
+def outputs_of(config: Any, predictions: AnchorPredictions | KASSDPredictions) -> tuple[Tensor, Tensor]:
     """Turn what a network says of one sweep into the outputs of its file.
 
     Args:
@@ -83,7 +83,7 @@ def outputs_of(config: Any, predictions: AnchorPredictions | KassdPredictions) -
         Boxes ``(A, 7)`` and scores ``(A, K)``, one row per anchor; of KASSD with KAM, one row per box that KAM scores,
         0 for other classes than the box's, and 0 where a row is none.
     """
-    if not isinstance(predictions, KassdPredictions):
+    if not isinstance(predictions, KASSDPredictions):
         return predictions.decoded()[0], torch.sigmoid(predictions.cls[0])
     found, head = predictions.candidates, predictions.head
     if found is None or predictions.scores is None:
@@ -131,7 +131,7 @@ def compare(content: bytes, model: Any, points: Tensor, sweep: str) -> Differenc
     with torch.inference_mode():
         predictions = model(Batch(points, sample, 1), voxels.grid)
         wanted, wanted_scores = outputs_of(model.config, predictions)
-        chosen = isinstance(predictions, KassdPredictions) and predictions.candidates is not None
+        chosen = isinstance(predictions, KASSDPredictions) and predictions.candidates is not None
         if scores.shape[1:] != wanted_scores.shape[1:] or not (chosen or boxes.shape == wanted.shape):
             raise BeamboxError(
                 f"the file gives boxes {tuple(boxes.shape)} and scores {tuple(scores.shape)}, the network "
@@ -140,7 +140,7 @@ def compare(content: bytes, model: Any, points: Tensor, sweep: str) -> Differenc
         if chosen:
             by_score, by_box, turned = chosen_differences(boxes, scores, wanted, wanted_scores)
         else:
-            head = predictions.head if isinstance(predictions, KassdPredictions) else predictions
+            head = predictions.head if isinstance(predictions, KASSDPredictions) else predictions
             apart, half_turns = box_differences(boxes, wanted, head.direction[0])
             by_score, by_box = float((scores - wanted_scores).abs().max()), float(apart.max())
             turned = int(half_turns.sum())
@@ -229,10 +229,12 @@ def opened(content: bytes) -> Any:
 
 def read_about(session: Any) -> dict[str, Any]:
     """Return what a file says of itself in its metadata; ``session`` is an ``onnxruntime.InferenceSession``."""
-    held = session.get_modelmeta().custom_metadata_map
-    if "beambox" not in held:
-        raise BeamboxError(f'expected a file that beambox exported, with "beambox" in its metadata, got {sorted(held)}')
-    return parse_json(held["beambox"], "its metadata")
+    metadata = session.get_modelmeta().custom_metadata_map
+    if "beambox" not in metadata:
+        raise BeamboxError(
+            f'expected a file that beambox exported, with "beambox" in its metadata, got {sorted(metadata)}'
+        )
+    return parse_json(metadata["beambox"], "its metadata")
 
 
 def gathered(about: dict[str, Any], points: Tensor) -> Voxels:

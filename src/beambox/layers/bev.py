@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, expect_same_length
 
-__all__ = ["BevBackbone", "MapBlock", "conv_bn_relu", "deconv_bn_relu", "expect_levels_meet", "join_levels"]
+__all__ = ["BevBackbone", "ConvBnReLU", "conv_bn_relu", "deconv_bn_relu", "expect_levels_meet", "join_levels"]
 
 BN_EPS = 1e-3
 BN_MOMENTUM = 0.01
 
 
-class MapBlock(nn.Sequential):
+class ConvBnReLU(nn.Sequential):
     """A convolution of maps, batch norm, ReLU."""
 
     def forward(self, bev: Tensor) -> Tensor:
@@ -24,10 +24,10 @@ class MapBlock(nn.Sequential):
         return super().forward(bev)  # torch.compile passes over the forward of torch's own class and enters this one
 
 
-def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> MapBlock:
+def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> ConvBnReLU:
     """Convolution that keeps the size (divided by ``stride``), batch norm (eps 1e-3, momentum 0.01), ReLU."""
     padding = dilation * (kernel // 2)
-    return MapBlock(
+    return ConvBnReLU(
         nn.Conv2d(in_channels, channels, kernel, stride, padding, dilation, bias=False),
         nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
         nn.ReLU(inplace=True),
@@ -36,9 +36,9 @@ def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int =
 
 def deconv_bn_relu(
     in_channels: int, channels: int, kernel: int, stride: int, padding: int = 0, output_padding: int = 0
-) -> MapBlock:
+) -> ConvBnReLU:
     """Transposed convolution that enlarges by ``stride``, batch norm, ReLU."""
-    return MapBlock(
+    return ConvBnReLU(
         nn.ConvTranspose2d(in_channels, channels, kernel, stride, padding, output_padding, bias=False),
         nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
         nn.ReLU(inplace=True),

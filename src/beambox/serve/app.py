@@ -56,7 +56,7 @@ class Query:
     """Names of the columns, as x,y,z,intensity,ring."""
     frame: str = ""
     """Name of the sweep, handed back."""
-    min_score: float = 0.0
+    score_threshold: float = 0.0
     """Leave out detections below this score."""
 
     @classmethod
@@ -74,13 +74,13 @@ class Query:
                 raise BeamboxError(f"`{name}` has {len(value)} characters, allowed 400")
         if given.get("frame"):
             check_file_name(given["frame"], "`frame`")
-        word = given.get("min_score", "0")
+        word = given.get("score_threshold", "0")
         try:
             score = float(word)
         except ValueError:
             score = math.nan
         if not 0 <= score <= 1:
-            raise BeamboxError(f"`min_score` must be a number from 0 to 1, got {word[:40]!a}")
+            raise BeamboxError(f"`score_threshold` must be a number from 0 to 1, got {word[:40]!a}")
         return cls(given.get("format", ""), given.get("fields", ""), given.get("frame", ""), score)
 
 
@@ -152,7 +152,7 @@ class Service:
             found = await self.batcher.submit(sweep)
         except BeamboxError as error:
             raise RequestError(400, str(error)) from error
-        return replace(found.above(query.min_score), frame_id=query.frame).to_json(self.model)
+        return replace(found.above(query.score_threshold), frame_id=query.frame).to_json(self.model)
 
     async def _read(self, content: bytes, kind: str, fields: str) -> Frame:
         columns = fields or self.detector.fields
@@ -169,7 +169,7 @@ class Service:
             "beambox": __version__,
             "classes": list(detector.classes),
             "range": {"minimum": list(detector.grid.minimum), "maximum": list(detector.grid.maximum)},
-            "columns": detector.config.columns,
+            "num_point_features": detector.config.num_point_features,
             "device": str(detector.device),
             "precision": str(detector.dtype).removeprefix("torch."),
             "formats": list(FORMATS),

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from beambox.checks import BeamboxError
-from beambox.data.reading import SUFFIXES, read_frame
+from beambox.data.read_points import SUFFIXES, read_frame
 from beambox.serve.limits import RequestError, ServeLimits
 from beambox.structures import Frame
 
@@ -73,7 +73,7 @@ def choose_format(asked: str, content_type: str, content: bytes) -> str:
 def read_body(
     content: bytes, kind: str, folder: Path, limits: ServeLimits, fields: str | None, intensity_scale: float | None
 ) -> Frame:
-    """Read a body as a file of its format; see :func:`beambox.data.reading.read_frame`.
+    """Read a body as a file of its format; see :func:`beambox.data.read_points.read_frame`.
 
     Args:
         content: the body.

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from beambox.geometry.constants import constant
-from beambox.ops.sparse_conv.sites import Geometry, Sites
+from beambox.ops.sparse_conv.sites import ConvSpec, Sites
 
-__all__ = ["MAP_CELLS", "MOST_SITES", "find_targets", "lower_bound", "neighbour_table"]
+__all__ = ["MAP_CELLS", "MOST_SITES", "find_targets", "lower_bound", "neighbor_table"]
 
 MAP_CELLS = 1 << 24
 """Cells of a level up to which rows are looked up in a map of it, four bytes a cell; beyond, keys are searched."""
@@ -18,12 +18,12 @@ MOST_SITES = 1 << 21
 """Sites of a level that the search can tell apart; a sweep has some ten thousand."""
 
 
-def find_targets(source: Sites, geometry: Geometry) -> Tensor:
+def find_targets(source: Sites, spec: ConvSpec) -> Tensor:
     """Return the ascending keys of every output whose receptive field holds an active input."""
-    shape = geometry.output_shape(source.shape)
+    shape = spec.output_shape(source.shape)
     index = source.indices
-    place = index[:, None, 1:] - geometry.offset_table(index.device)  # (V, K, 3) output * stride
-    stride, extent = constant(geometry.stride, index.device), constant(shape, index.device)
+    place = index[:, None, 1:] - spec.offset_table(index.device)  # (V, K, 3) output * stride
+    stride, extent = constant(spec.stride, index.device), constant(shape, index.device)
     target = torch.div(place, stride, rounding_mode="floor")  # (V, K, 3)
     lands = ((target * stride == place) & (target >= 0) & (target < extent)).all(dim=2)  # (V, K)
     line = (index[:, :1] * shape[0] + target[..., 0]) * shape[1] + target[..., 1]  # (V, K)
@@ -34,12 +34,12 @@ def find_targets(source: Sites, geometry: Geometry) -> Tensor:
     return torch.nonzero(reached[:cells])[:, 0]
 
 
-def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
+def neighbor_table(source: Sites, target: Sites, spec: ConvSpec) -> Tensor:
     """Find the input row that reaches each output through each kernel offset: ``(V_out, K)`` int64, -1 for none."""
     nz, ny, nx = source.shape
     device = source.sorted_keys.device
-    stride, extent = constant(geometry.stride, device), constant(source.shape, device)
-    place = target.indices[:, None, 1:] * stride + geometry.offset_table(device)  # (V_out, K, 3)
+    stride, extent = constant(spec.stride, device), constant(source.shape, device)
+    place = target.indices[:, None, 1:] * stride + spec.offset_table(device)  # (V_out, K, 3)
     inside = ((place >= 0) & (place < extent)).all(dim=2)
     line = (target.indices[:, :1] * nz + place[..., 0]) * ny + place[..., 1]
     wanted = line * nx + place[..., 2]  # (V_out, K)
@@ -48,14 +48,14 @@ def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
         rows = torch.full((cells,), -1, dtype=torch.int32, device=device)
         rows = rows.scatter(0, source.sorted_keys, source.order.int())
         return torch.where(inside, rows[torch.where(inside, wanted, 0)].long(), -1)
-    return torch.where(inside, search(source, wanted, geometry, min(MOST_SITES, cells).bit_length()), -1)
+    return torch.where(inside, search(source, wanted, spec, min(MOST_SITES, cells).bit_length()), -1)
 
 
-def search(source: Sites, wanted: Tensor, geometry: Geometry, steps: int) -> Tensor:
+def search(source: Sites, wanted: Tensor, spec: ConvSpec, steps: int) -> Tensor:
     """Find the row of each wanted key ``(V_out, K)``, -1 for none, by one binary search per row of the kernel."""
     keys = torch.cat((source.sorted_keys, source.sorted_keys.new_full((1,), torch.iinfo(torch.int64).max)))
     order = torch.cat((source.order, source.order.new_full((1,), -1)))  # the search may end behind the last one
-    width = geometry.kernel[2] if geometry.dilation[2] == 1 else 1
+    width = spec.kernel[2] if spec.dilation[2] == 1 else 1
     row = lower_bound(keys, wanted[:, ::width], steps)  # (V_out, K / width) of the first of each row of the kernel
     columns = []
     for k in range(width):

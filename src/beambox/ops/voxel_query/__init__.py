@@ -34,21 +34,21 @@ BACKENDS = (
 
 
 def voxel_query(
-    points: Tensor, cells: Tensor, sites: Sites, centres: Tensor, reach: Triple, radius: float, samples: int
+    points: Tensor, cells: Tensor, sites: Sites, centers: Tensor, query_range: Triple, radius: float, max_samples: int
 ) -> Tensor:
     """Find the first active voxels around each point (Voxel R-CNN, section 3.2).
 
-    The cells within ``reach`` of a point's own cell are visited with x fastest, then y, then z; an active one whose
-    centre is no farther than ``radius`` from the point is taken, until there are ``samples``. No gradient.
+    The cells within ``query_range`` of a point's own cell are visited with x fastest, then y, then z; an active one
+    whose centre is no farther than ``radius`` from the point is taken, until there are ``max_samples``. No gradient.
 
     Args:
         points: ``(M, 3)`` x, y, z in metres.
         cells: ``(M, 4)`` int64 (b, z, y, x) of the cell each point lies in; may lie outside the grid.
         sites: the active voxels.
-        centres: ``(V, 3)`` x, y, z of the voxels' centres in metres.
-        reach: cells looked at on both sides (z, y, x).
+        centers: ``(V, 3)`` x, y, z of the voxels' centres in metres.
+        query_range: cells looked at on both sides (z, y, x).
         radius: metres.
-        samples: number of voxels S.
+        max_samples: number of voxels S.
 
     Returns:
         ``(M, S)`` int64 rows of ``sites``; where fewer are found the first is repeated, where none is all are -1.
@@ -58,12 +58,14 @@ def voxel_query(
     """
     expect_shape("points", points, ("M", 3))
     expect_shape("cells", cells, ("M", 4))
-    expect_shape("centres", centres, (len(sites), 3))
+    expect_shape("centres", centers, (len(sites), 3))
     expect_same_length(points=len(points), cells=len(cells))
-    if min(reach) < 0 or not radius > 0 or samples < 1:
+    if min(query_range) < 0 or not radius > 0 or max_samples < 1:
         raise BeamboxError(
             f"a voxel query needs a reach of at least 0, a positive radius and at least 1 sample, "
-            f"got {reach}, {radius} and {samples}"
+            f"got {query_range}, {radius} and {max_samples}"
         )
-    points, centres = points.detach(), centres.detach().to(points.dtype)
-    return choose("voxel_query", BACKENDS, points, cells)(points, cells, sites, centres, reach, radius, samples)
+    points, centers = points.detach(), centers.detach().to(points.dtype)
+    return choose("voxel_query", BACKENDS, points, cells)(
+        points, cells, sites, centers, query_range, radius, max_samples
+    )
