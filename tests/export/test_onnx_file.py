@@ -35,7 +35,7 @@ from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
 from oracles.command_line import beambox
 from oracles.paths import ROOT
-from oracles.small_detectors import HCNET, KASSD, POINTPILLARS, SECOND, SMALL, build_small, car_frame
+from oracles.small_detectors import HCNET, KASSD_CONFIG, POINTPILLARS, SECOND, SMALL, build_small, car_frame
 from oracles.tiny_detector import street, tiny_model
 
 ELSEWHERE = VoxelGrid((-10.24, -5.12, -3), (10.24, 5.12, 1), (0.32, 0.32, 4))
@@ -45,7 +45,7 @@ CASES: dict[str, tuple[str, Any, VoxelGrid | None, int]] = {
     "hcnet": ("hcnet", HCNET, None, 20),
     "padded pillars elsewhere": ("pointpillars", replace(POINTPILLARS, empty_slots=True, max_points=4), ELSEWHERE, 23),
     "second": ("second", replace(SECOND, anchors=KITTI_ANCHORS[:2]), None, 18),
-    "kassd": ("kassd", replace(KASSD, anchors=KITTI_ANCHORS), None, 19),
+    "kassd": ("kassd", replace(KASSD_CONFIG, anchors=KITTI_ANCHORS), None, 19),
 }
 
 

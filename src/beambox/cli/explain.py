@@ -33,6 +33,9 @@ def command(  # each is an option of the command line
     HCNet: the weights of height slices and channels. KASSD: the weights of places and the scores of keypoints. DenNet:
     the densities of voxels, and what the surest boxes attend to.
     """
+    from beambox.checks import expect_library
+
+    expect_library("matplotlib", "plots", "drawing what a detector weighs")
     options.expect_there(inputs, model)
 
     from beambox.explain.pictures import explain

@@ -23,7 +23,7 @@ import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.box_files import box_words
-from beambox.data.read_points import SUFFIXES, read_frame
+from beambox.data.read_points import read_frame, readable_suffixes
 from beambox.io import name_to_word, read_names, read_text
 from beambox.structures import Frame, Labels
 
@@ -61,17 +61,17 @@ class FolderSource:
         self.root = Path(root)
         self.labels_folder = self.root / labels
         self.fields, self.intensity_scale = fields, intensity_scale
-        folder = self.root / points
+        folder, suffixes = self.root / points, readable_suffixes()
         if not folder.is_dir():
-            raise MissingFileError(f"{folder} is not a folder; expected one of sweeps ({' '.join(SUFFIXES)})")
+            raise MissingFileError(f"{folder} is not a folder; expected one of sweeps ({' '.join(suffixes)})")
         found: dict[str, Path] = {}
         for path in sorted(folder.iterdir()):
-            if path.suffix.lower() in SUFFIXES:
+            if path.suffix.lower() in suffixes:
                 if path.stem in found:
                     raise BeamboxError(f"{folder} holds two sweeps called {path.stem}; names must differ")
                 found[path.stem] = path
         if not found:
-            raise BeamboxError(f"{folder} must hold sweeps ({' '.join(SUFFIXES)}), but has none")
+            raise BeamboxError(f"{folder} must hold sweeps ({' '.join(suffixes)}), but has none")
         names = list(found) if split == "all" else _names(self.root / "ImageSets", split)
         for name in names:
             if name not in found:

@@ -31,6 +31,7 @@ from torch import Tensor
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.formats.arrays import array_columns, read_npy, read_npz
 from beambox.data.formats.binary import read_bin
+from beambox.data.formats.brought import brought_reader, brought_suffixes
 from beambox.data.formats.columns import Columns
 from beambox.data.formats.las import read_las
 from beambox.data.formats.pcd import read_pcd
@@ -38,7 +39,15 @@ from beambox.data.formats.ply import read_ply
 from beambox.data.formats.recording import read_message, recording_of
 from beambox.structures import Frame
 
-__all__ = ["SUFFIXES", "frame_from_columns", "points_from_array", "read_frame", "read_points", "read_shifted"]
+__all__ = [
+    "SUFFIXES",
+    "frame_from_columns",
+    "points_from_array",
+    "read_frame",
+    "read_points",
+    "read_shifted",
+    "readable_suffixes",
+]
 
 READERS: dict[str, Callable[[Path], Columns]] = {
     ".npy": read_npy,
@@ -49,7 +58,7 @@ READERS: dict[str, Callable[[Path], Columns]] = {
     ".laz": read_las,
 }
 SUFFIXES = (".bin", *READERS)
-"""Endings of the files that can be read."""
+"""Endings of the files that can be read, without those that installed packages bring."""
 
 STANDARD = ("x", "y", "z", "intensity")
 POSITIONS = {
@@ -109,6 +118,11 @@ def read_points(
     return _read(Path(path), fields, intensity_scale)[0]
 
 
+def readable_suffixes() -> tuple[str, ...]:
+    """Return the endings of the files that can be read, with those that installed packages bring."""
+    return (*SUFFIXES, *(suffix for suffix in brought_suffixes() if suffix not in SUFFIXES))
+
+
 def points_from_array(
     array: np.ndarray | Tensor, intensity_scale: float | None = None
 ) -> tuple[Tensor, tuple[str, ...]]:
@@ -145,11 +159,13 @@ def _read(path: Path, fields: str | Sequence[str] | None, scale: float | None) -
     suffix = path.suffix.lower()
     if suffix == ".bin":
         return _assemble(_bin_columns(path, names), str(path), names, scale)
-    if suffix not in READERS and recording_of(path) is not None:
+    reader = READERS.get(suffix) or brought_reader(suffix)
+    if reader is None and recording_of(path) is not None:
         return _assemble(read_message(path), str(path), names, scale)
-    if suffix not in READERS:
-        raise BeamboxError(f'{path} has the ending "{suffix}", which no reader knows{did_you_mean(suffix, SUFFIXES)}')
-    columns = READERS[suffix](path)
+    if reader is None:
+        hint = did_you_mean(suffix, readable_suffixes())
+        raise BeamboxError(f'{path} has the ending "{suffix}", which no reader knows{hint}')
+    columns = reader(path)
     if names is not None and suffix in (".npy", ".npz") and columns.names[4:5] in ((), ("column 5",)):
         if len(names) != len(columns.names):
             raise BeamboxError(f"{path} has {len(columns.names)} columns, but `fields` names {len(names)}: {names}")

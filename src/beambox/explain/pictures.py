@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, expect_library
 from beambox.detectors.dennet import DenNet, NeighborhoodAttention
 from beambox.detectors.hcnet import HCNet, pillar_stacks
 from beambox.detectors.kassd.keypoints import map_coordinates, sample_bilinear
@@ -40,6 +40,7 @@ def explain(detector: Detector, frame: Frame, score_threshold: float = 0.3) -> l
     Raises:
         BeamboxError: for another detector, or a sweep with no point where it looks.
     """
+    expect_library("matplotlib", "plots", "drawing what a detector weighs")
     drawers: dict[type, Callable[..., Iterator[Explained]]] = {HCNet: _hcnet, KASSD: _kassd, DenNet: _dennet}
     drawer = next((draw for kind, draw in drawers.items() if isinstance(detector.model, kind)), None)
     if drawer is None:

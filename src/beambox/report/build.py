@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from beambox import __version__
-from beambox.checks import BeamboxError, MissingFileError
+from beambox.checks import BeamboxError, MissingFileError, expect_library
 from beambox.data.custom import CustomSource
 from beambox.data.custom_config import KITTI_GROUND
 from beambox.data.once import OnceSource
@@ -203,7 +203,8 @@ def after_evaluation(
 
 
 def check_page(out: Path) -> None:
-    """Refuse a name that is no page's, before anything is measured."""
+    """Refuse a name that is no page's, and to begin without what draws it, before anything is measured."""
+    expect_library("matplotlib", "plots", "a report")
     if out.suffix.lower() not in (".html", ".htm"):
         raise BeamboxError(f"a report is a page, so its name ends in .html; got {out}")
 
