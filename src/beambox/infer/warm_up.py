@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any, cast
 
 import torch
 
@@ -17,10 +18,10 @@ from beambox.zoo import DEFAULT, shipped
 
 __all__ = ["steps_to_warm", "warm_up"]
 
-WINDOW = 32
-"""Edge of the part of the range on which a step of training is tried, in cells of the network's coarsest map."""
+WINDOW = 256
+"""Edge of the part of the range on which a step of training is tried, in cells."""
 COARSE = 8
-"""Cells of the grid in one of its coarsest map."""
+"""Its place is a multiple of so many cells, that of the coarsest map."""
 
 
 def steps_to_warm(training: bool = True) -> list[tuple[str, str]]:
@@ -64,14 +65,14 @@ def _train(name: str, frame: Frame, device: str) -> None:
     """Compute losses and gradients once, on a small part of the range."""
     chosen = load(name, device=device).device
     model = load_weights(find_weights(name), chosen).train()
-    grid: VoxelGrid = model.config.grid  # pyright: ignore[reportAttributeAccessIssue]
-    size = COARSE * WINDOW
-    maximum = [low + size * cell for low, cell in zip(grid.minimum[:2], grid.cell[:2])]
-    window = VoxelGrid(grid.minimum, (*maximum, grid.maximum[2]), grid.cell)
+    grid: VoxelGrid = cast(Any, model).config.grid
+    nx, ny, _ = grid.size
+    side = min(WINDOW, nx, ny)
+    window = grid.window((0, (ny - side) // 2 // COARSE * COARSE), (side, side))  # straight ahead
     assert frame.labels is not None, "simulated frames are labelled"
     batch = Batch.of([frame.camera_view(), frame.camera_view()]).to(chosen)
     labels = [frame.labels, frame.labels]
-    losses = model.loss(model(batch, window, labels=labels), labels)  # pyright: ignore[reportCallIssue]
+    losses = cast(Any, model).loss(model(batch, window, labels=labels), labels)
     torch.stack(list(losses.values())).sum().backward()
 
 
