@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, MissingFileError, import_library
-from beambox.detectors.contract import DetectorModel
 from beambox.detectors.kassd import KamScore, KASSDPredictions
 from beambox.geometry.boxes import wrap_angle
 from beambox.geometry.grid import VoxelGrid
