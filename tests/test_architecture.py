@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "explain": {"infer", "detectors", "layers", "ops", "structures", "visualize", "geometry"},
     "report": {"infer", "data", "metrics", "visualize", "structures", "geometry", "ops", "zoo"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
+    "serve": {"infer", "data", "structures", "geometry"},
     "stream": {"track", "infer", "data", "structures", "geometry"},
     "track": {"infer", "data", "metrics", "structures", "geometry", "ops"},
     "zoo": set(),

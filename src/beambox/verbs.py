@@ -315,7 +315,7 @@ def export(
     opset: int = 18,
     verify: str | Path | None = None,
 ) -> Written:
-    """Write PointPillars or HCNet as one ONNX file, after onnxruntime has computed from it what PyTorch computes.
+    """Write a detector of one stage as an ONNX file, after onnxruntime has computed from it what PyTorch computes.
 
     Args:
         model: a shipped name, a weight file, or the folder of a training run.
