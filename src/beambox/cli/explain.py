@@ -45,7 +45,7 @@ def command(  # each is an option of the command line
 
     show_log()
     sweeps = find_sweeps(inputs)
-    detector = load(model, **how.for_load() | {"precision": "float32"})
+    detector = load(model, **{**how.for_load(), "precision": "float32"})
     for sweep in sweeps:
         for one in explain(detector, detector.read(sweep), score_threshold):
             path = out / f"{sweep.name}_{one.name}.png"

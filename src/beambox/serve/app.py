@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean, how_to_install, printable
-from beambox.io import check_file_name
+from beambox.file_names import check_file_name
 from beambox.serve.batching import Batcher
 from beambox.serve.bodies import FORMATS, choose_format, read_body
 from beambox.serve.limits import RequestError, ServeLimits
