@@ -61,8 +61,8 @@ from beambox.layers.bev import (
     BN_MOMENTUM,
     conv_bn_relu,
     deconv_bn_relu,
+    enlarge_and_join,
     expect_levels_meet,
-    join_levels,
 )
 from beambox.layers.encoders import mean_voxels
 from beambox.layers.heads import PostProcess
@@ -406,10 +406,10 @@ class AttentiveBackbone(nn.Module):
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, 256, Y, X)``: stages downwards, all enlarged and joined."""
         levels = []
-        for stage, up in zip(self.stages, self.ups):
+        for stage in self.stages:
             bev = stage(bev)  # (B, 64, Y, X), then (B, 128, Y / 2, X / 2)
-            levels.append(up(bev))  # (B, 128, Y, X)
-        return join_levels(levels)
+            levels.append(bev)
+        return enlarge_and_join(self.ups, levels)  # each (B, 128, Y, X)
 
 
 class AttentiveStage(nn.Module):

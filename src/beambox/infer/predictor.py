@@ -22,7 +22,9 @@ from beambox.geometry.axes import Axes
 from beambox.infer.corrections import Corrections
 from beambox.infer.forking import survive_fork
 from beambox.infer.fusion import fold_batch_norms
+from beambox.infer.ground import EmptyGround
 from beambox.infer.inputs import Sweep, read_sweep
+from beambox.infer.memory import keep_memory
 from beambox.infer.precision import choose_device, choose_precision
 from beambox.infer.streaming import Input, each_input, groups, names_one_sweep
 from beambox.infer.trained import Trained
@@ -87,6 +89,9 @@ class Detector:
         survive_fork()
         folded = fold_batch_norms(model).to(self.device)
         self.model: Any = channels_last(folded)
+        self.ground = EmptyGround()
+        if self.device.type == "cpu":
+            keep_memory()
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -203,6 +208,7 @@ class Detector:
         survive_fork()
         lower = self.dtype != torch.float32
         with torch.autocast(self.device.type, dtype=self.dtype if lower else torch.bfloat16, enabled=lower):
+            self.ground.learn(self.model, self.grid)
             return self.model(batch, self.grid)
 
     @torch.inference_mode()
