@@ -123,9 +123,9 @@ class AnchorHead(nn.Module):
     @torch.inference_mode(False)
     @torch.no_grad()
     def one(self) -> GroundedConv | None:
-        """Return the three as one convolution, made anew once a weight has changed; None while they may be learnt."""
+        """Return the three as one convolution, made anew once a weight has changed; None where changes do not show."""
         weights = list(self.parameters())
-        if not self.is_folded or any(weight.is_inference() for weight in weights):
+        if any(weight.is_inference() for weight in weights):
             return None
         state = tuple(n for weight in weights for n in (weight.data_ptr(), weight._version))
         if self._one is None or self._one[0] != state:
@@ -141,7 +141,7 @@ class AnchorHead(nn.Module):
             grid: the region the map covers.
         """
         layers = (self.cls, self.box, self.direction)
-        one = self.one()
+        one = self.one() if self.is_folded else None
         if one is not None and one.is_fused(bev):
             cells = one(bev).permute(0, 2, 3, 1)  # (B, Y, X, A * (K + 7 + 2))
         else:  # a 1 x 1 convolution is a matrix product, and one is faster than three

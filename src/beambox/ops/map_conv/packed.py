@@ -17,7 +17,7 @@ __all__ = ["Packed", "Panels", "Phase"]
 
 
 class Panels(NamedTuple):
-    """A matrix cut into panels of a few vectors; where its width is no whole number of vectors, the last one overlaps."""
+    """A matrix cut into panels of a few vectors; where its width is no whole number of them, the last one overlaps."""
 
     columns: np.ndarray
     """``(P,)`` int64 first column of each panel."""
@@ -64,8 +64,10 @@ class Phase:
 
 @dataclass(frozen=True)
 class Packed:
-    """A kernel for the CPU. A base cell (i, j) reads from input cell ``in_step * (i, j)`` and makes ``out_step`` rows
-    and columns of output cells, by one phase each, or all together by Winograd's products.
+    """A kernel for the CPU.
+
+    A base cell (i, j) reads from input cell ``in_step * (i, j)`` and makes ``out_step`` rows and columns of output
+    cells, by one phase each, or all together by Winograd's products.
     """
 
     in_step: int
