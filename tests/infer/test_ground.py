@@ -91,6 +91,18 @@ def test_changed_weights_are_noticed_and_learnt_again(frames: list[Frame]) -> No
     assert found.ground.learnt()
 
 
+def test_parameters_put_in_place_of_others_are_used(frames: list[Frame]) -> None:
+    found = detector("pointpillars")
+    for _ in range(3):
+        found.predict(Batch.of(frames[:1]))
+    conv = found.model.backbone.stages[0][1][0]
+    conv.weight = torch.nn.Parameter(-2 * conv.weight.detach())
+    fresh = detector("pointpillars")
+    with torch.no_grad():
+        fresh.model.backbone.stages[0][1][0].weight.mul_(-2)
+    assert all(map(torch.equal, answers(found, frames[0]), answers(fresh, frames[0])))
+
+
 def test_another_region_is_learnt_for_itself(frames: list[Frame]) -> None:
     found = detector("second")
     for _ in range(2):

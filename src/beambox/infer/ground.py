@@ -20,13 +20,14 @@ class EmptyGround:
     def __init__(self) -> None:
         self._learnt: tuple[Any, ...] | None = None
         self._met: tuple[Any, ...] | None = None
+        self._weights: list[nn.Parameter] = []
 
     def learn(self, model: nn.Module, grid: VoxelGrid) -> None:
         """Let a network see an empty sweep before its second real one, and again once weights or region have changed.
 
         Not before the first, as often there is no second. Only on a CPU in float32: elsewhere all cells are computed.
         """
-        weights = list(model.parameters())
+        weights = self._weights = self._weights or list(model.parameters())  # walking the layers takes milliseconds
         if not weights or weights[0].device.type != "cpu" or torch.is_autocast_enabled("cpu"):
             return
         if any(weight.is_inference() for weight in weights):  # they do not count their changes

@@ -30,12 +30,21 @@ BN_MOMENTUM = 0.01
 class MapBlock(nn.Sequential):
     """A convolution of maps, batch norm, ReLU; once folded, one operation."""
 
-    folded: GroundedConv | None = None
+    _folded: GroundedConv | None = None
+
+    @property
+    def folded(self) -> GroundedConv | None:
+        """The one operation, of the layer's present weights; None before it is folded."""
+        kernel = None if self._folded is None else self._folded.kernel
+        if kernel is not None and (kernel.weight is not self[0].weight or kernel.bias is not self[0].bias):
+            self._folded = self.operation()  # somebody put other parameters in their place
+        return self._folded
 
     def forward(self, bev: Tensor, out: Tensor | None = None) -> Tensor:
         """Map ``(B, C, Y, X)`` to ``(B, channels, Y', X')``; a folded block writes to ``out`` where it is given."""
-        if self.folded is not None:
-            return self.folded(bev, out)
+        folded = self.folded
+        if folded is not None:
+            return folded(bev, out)
         return super().forward(bev)  # torch.compile passes over the forward of torch's own class and enters this one
 
     def fold(self) -> None:
@@ -45,11 +54,17 @@ class MapBlock(nn.Sequential):
             return  # it is folded already
         conv = fuse_conv_bn_eval(conv, norm, transpose=isinstance(conv, nn.ConvTranspose2d))
         self[0], self[1] = conv, nn.Identity()
+        self._folded = self.operation()
+
+    def operation(self) -> GroundedConv:
+        """Make one operation of the folded convolution and ReLU."""
+        conv = self[0]
+        assert isinstance(conv, nn.Conv2d | nn.ConvTranspose2d)
         padding, output_padding = conv.padding, conv.output_padding
         assert isinstance(padding, tuple) and isinstance(output_padding, tuple)
         transposed = isinstance(conv, nn.ConvTranspose2d)
         options = (conv.stride[0], padding[0], conv.dilation[0], transposed, output_padding[0])
-        self.folded = GroundedConv(MapKernel(conv.weight, conv.bias, *options, relu=True))
+        return GroundedConv(MapKernel(conv.weight, conv.bias, *options, relu=True))
 
 
 def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> MapBlock:
