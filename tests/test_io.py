@@ -238,3 +238,10 @@ def test_names_of_classes_survive_text_files(name: str) -> None:
     assert word.split() == [word] and word.isprintable() and not word.startswith("#") and word.lower() != "dontcare"
     assert io.word_to_name(word) == name
     assert io.name_to_word("Car") == "Car" and io.word_to_name("100%ABC") == "100%ABC"
+
+
+def test_an_error_that_quotes_a_file_stays_short() -> None:
+    error = BeamboxError(f'unknown class "{"9" * 5000}" (known: Car)')
+    assert len(str(error)) < 1600
+    assert str(error).startswith('unknown class "999') and str(error).endswith("(known: Car)")
+    assert "(5,029 characters)" in str(error)

@@ -36,8 +36,15 @@ LONGEST_WORD = 200
 """No name is looked up by likeness that has more letters: it is no typing error, and comparing takes long."""
 
 
+LONGEST_MESSAGE = 1500
+"""Characters of an error's message: names in files have any length, and the middle of what quotes them is left out."""
+
+
 class BeamboxError(ValueError):
     """Something the user gave cannot be used; the message says what was expected, what came and what to do."""
+
+    def __init__(self, *parts: object) -> None:
+        super().__init__(*(_shortened(part, LONGEST_MESSAGE) if isinstance(part, str) else part for part in parts))
 
 
 class MissingFileError(BeamboxError, FileNotFoundError):
@@ -153,15 +160,22 @@ def printable(text: str, limit: int | None = None) -> str:
         text: anything.
         limit: longest result in characters; the middle of longer texts is left out, and their length said.
     """
-    if limit is not None and len(text) > limit:
-        half = max(1, limit // 2 - 20)
-        text = f"{text[:half]} ... ({len(text):,} characters) ... {text[-half:]}"
+    if limit is not None:
+        text = _shortened(text, limit)
     if text.replace("\n", "").replace("\t", "").isprintable():
         return text
     return "".join(
         letter if letter.isprintable() or letter in "\n\t" else letter.encode("unicode_escape").decode()
         for letter in text
     )
+
+
+def _shortened(text: str, limit: int) -> str:
+    """Leave out the middle of a text that is longer than ``limit``, and say its length there."""
+    if len(text) <= limit:
+        return text
+    half = max(1, limit // 2 - 20)
+    return f"{text[:half]} ... ({len(text):,} characters) ... {text[-half:]}"
 
 
 def how_to_install(extra: str) -> str:

@@ -243,6 +243,16 @@ def test_nothing_found_is_zero_and_no_objects_is_unknown() -> None:
     assert "the labels have no Car" in result.table() and "capped" not in result.table()
 
 
+def test_labels_without_image_boxes_are_not_called_absent(tmp_path: Path) -> None:
+    label = "Car 0 0 0.5 0 0 0 0 1.5 1.6 4 0 1.7 20 0"
+    folders = write(tmp_path, [(f"{label}\n{label}", f"{label} 0.9")])
+    table = evaluate_files(*folders, classes=["Car", "Cyclist"]).table()
+    assert "the labels have 2 Car, but none that KITTI's levels count" in table and "--no-difficulty" in table
+    assert "the labels have no Car" not in table and "the labels have no Cyclist" in table
+    every = evaluate_files(*folders, classes=["Car"], no_difficulty=True)
+    assert every["Car"].objects == (2,) and every["Car"].labelled == 2
+
+
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     labels, results = write(tmp_path, [scene(np.random.default_rng(1)) for _ in range(2)])
     (results / "000001.txt").unlink()

@@ -22,8 +22,8 @@ def command(
     ] = None,
     runs: Annotated[int, typer.Option(min=1, help="Passes that count.")] = 50,
     warmup: Annotated[int, typer.Option(min=0, help="Passes before them.")] = 20,
-    batch: Annotated[int, typer.Option(min=1, help="Sweeps in one pass.")] = 1,
-    threads: Annotated[int, typer.Option(min=0, help="Threads of the CPU; 0 leaves torch's choice.")] = 0,
+    batch: Annotated[int, typer.Option(min=1, max=1024, help="Sweeps in one pass.")] = 1,
+    threads: Annotated[int, typer.Option(min=0, max=1024, help="Threads of the CPU; 0 leaves torch's choice.")] = 0,
     protocol: Annotated[
         str, typer.Option(help="stages, or kassd: three parts, mean of ten runs, as in its Table 7.")
     ] = "stages",

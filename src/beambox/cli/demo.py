@@ -18,9 +18,9 @@ __all__ = ["command"]
 def command(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for everything.")] = Path("demo"),
     model: Annotated[str, typer.Option("--model", "-m", metavar="M", help="Weights; a shipped set if none.")] = "",
-    frames: Annotated[int, typer.Option(min=1, help="Sweeps to simulate.")] = 6,
+    frames: Annotated[int, typer.Option(min=1, max=10_000, help="Sweeps to simulate.")] = 6,
     sensor: Annotated[str, typer.Option(help="Simulated sensor.")] = "hdl64",
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same sweeps.")] = 2026,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Same seed, same sweeps.")] = 2026,
     device: options.DeviceOption = "auto",
 ) -> None:
     """Simulate a few sweeps, detect with shipped weights, score and draw; leaves pictures and a table in demo/.

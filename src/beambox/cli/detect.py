@@ -48,7 +48,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     precision: options.PrecisionOption = "auto",
     skip_existing: Annotated[bool, typer.Option("--skip-existing", help="Leave out sweeps that are done.")] = False,
     shard: Annotated[str, typer.Option(metavar="I/N", help="Do the I-th of N parts, as on machine I of N.")] = "1/1",
-    workers: Annotated[int, typer.Option(min=1, metavar="W", help="Processes, of one thread each.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=1024, metavar="W", help="Processes, of one thread each.")] = 1,
 ) -> None:
     """Find objects in sweeps; writes one result file a sweep.
 

@@ -51,7 +51,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         bool,
         typer.Option("--published", help="ONCE: print the rows of DenNet's Table 3 as well, apart from ours."),
     ] = False,
-    batch: Annotated[int, typer.Option(min=1, help="Frames in one pass.")] = 1,
+    batch: Annotated[int, typer.Option(min=1, max=1024, help="Frames in one pass.")] = 1,
     device: DeviceOption = "auto",
     precision: PrecisionOption = "auto",
 ) -> None:

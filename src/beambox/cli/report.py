@@ -39,7 +39,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     worst: Annotated[int, typer.Option(min=0, help="Pictures of each kind of failure and class.")] = 6,
     range_: RangeOption = "",
     view: ViewOption = "auto",
-    batch: Annotated[int, typer.Option(min=1, help="Frames in one pass.")] = 1,
+    batch: Annotated[int, typer.Option(min=1, max=1024, help="Frames in one pass.")] = 1,
     device: DeviceOption = "auto",
     precision: PrecisionOption = "auto",
 ) -> None:

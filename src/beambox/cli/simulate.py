@@ -12,7 +12,7 @@ __all__ = ["command"]
 
 def command(
     out: Annotated[Path, typer.Argument(help="folder to write")],
-    frames: Annotated[int, typer.Option(help="how many sweeps", min=1)] = 100,
+    frames: Annotated[int, typer.Option(help="how many sweeps", min=1, max=1_000_000)] = 100,
     files: Annotated[
         str,
         typer.Option("--format", help="layout of the files: kitti, or once (whole turns, its axes and five classes)"),
@@ -27,12 +27,12 @@ def command(
     layout_split: Annotated[
         str, typer.Option(help="frames of the layouts' ImageSets to use; all: every frame")
     ] = "train",
-    seed: Annotated[int, typer.Option(help="same seed, same data", min=0)] = 0,
-    workers: Annotated[int, typer.Option(help="processes", min=1)] = 1,
+    seed: Annotated[int, typer.Option(help="same seed, same data", min=0, max=2**32 - 1)] = 0,
+    workers: Annotated[int, typer.Option(help="processes", min=1, max=1024)] = 1,
     val_share: Annotated[
         float, typer.Option(help="share of the sweeps (once: of the sequences) listed in ImageSets/val.txt")
     ] = 0.1,
-    sequence_length: Annotated[int, typer.Option(help="once: sweeps in one sequence", min=1)] = 10,
+    sequence_length: Annotated[int, typer.Option(help="once: sweeps in one sequence", min=1, max=10_000)] = 10,
     compare: Annotated[
         Path | None,
         typer.Option(

@@ -15,6 +15,7 @@ from beambox.checks import BeamboxError, did_you_mean
 from beambox.detectors.dennet import DenNetConfig, dennet, names_since
 from beambox.detectors.hcnet import HCNetConfig, hcnet
 from beambox.detectors.kassd import KassdConfig, kassd
+from beambox.detectors.limits import MOST_ELEMENTS, bounded, check_numbers
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
 from beambox.detectors.renames import current_fields, current_names
 from beambox.detectors.second import SecondConfig, second
@@ -45,18 +46,21 @@ CATALOGUE: dict[str, CatalogueEntry] = {
 }
 
 
-def build(name: str, options: Mapping[str, Any] | None = None) -> Any:
+def build(name: str, options: Mapping[str, Any] | None = None, most: int = MOST_ELEMENTS) -> Any:
     """Build a detector by name.
 
     Args:
         name: a key of :data:`CATALOGUE`, or of a detector that an installed package brings (:func:`entry_of`).
         options: fields of its configuration that differ from the defaults, as plain values (from YAML or JSON).
+        most: values that all parameters and buffers may have together.
 
     Raises:
-        BeamboxError: for an unknown name, an unknown field or a value of the wrong type.
+        BeamboxError: for an unknown name, an unknown field, a value of the wrong type, or a network that is too large.
     """
     entry = entry_of(name)
-    return entry.build(config_from_dict(entry.config, options or {}))
+    config = config_from_dict(entry.config, options or {})
+    with bounded(name, most):
+        return entry.build(config)
 
 
 def entry_of(name: str) -> CatalogueEntry:
@@ -108,13 +112,15 @@ def config_from_dict(config_type: type, options: Mapping[str, Any]) -> Any:
     """
     complete = _completed(current_fields(options), config_to_dict(config_type()), config_type.__name__)
     try:
-        return TypeAdapter(config_type).validate_python(complete)
+        config = TypeAdapter(config_type).validate_python(complete)
     except ValidationError as error:
         first = error.errors()[0]
         where, given = ".".join(str(part) for part in first["loc"]), first["input"]
         words = re.findall("'([^']+)'", first.get("ctx", {}).get("expected", "")) if first["type"] == "enum" else []
         hint = did_you_mean(given, words) if words and isinstance(given, str) else ""
         raise BeamboxError(f"`{where}`: {first['msg']}, got {given!r}{hint}") from None
+    check_numbers(config_to_dict(config))  # now that whole numbers stand for lengths where a length is meant
+    return config
 
 
 def _completed(options: Mapping[str, Any], defaults: Mapping[str, Any], owner: str, prefix: str = "") -> dict[str, Any]:

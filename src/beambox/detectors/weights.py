@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.detectors.catalogue import build, config_to_dict, name_of, tensors_since
-from beambox.io import write_bytes
+from beambox.io import parse_json, write_bytes
 
 __all__ = ["WeightFile", "load_weights", "read_weights", "save_weights"]
 
@@ -91,12 +91,16 @@ def read_weights(path: str | Path) -> WeightFile:
                     f"{path} is a safetensors file, but not one of beambox's (no format {FORMAT} in its header)"
                 )
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}
-        return WeightFile(header["detector"], json.loads(header["config"]), json.loads(header["card"]), tensors)
-    except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
+        detector = header["detector"]
+        config, card = (parse_json(header[part], f"{path}, its {part}") for part in ("config", "card"))
+    except (SafetensorError, OSError, KeyError) as error:
         raise BeamboxError(
             f"{path} is not a readable weight file ({error}); expected a whole .safetensors file written by beambox. "
             "A checkpoint of OpenPCDet is converted by `beambox import-openpcdet`"
         ) from error
+    if not isinstance(config, dict) or not isinstance(card, dict):
+        raise BeamboxError(f"{path} is a damaged weight file: its config and its card must be mappings")
+    return WeightFile(detector, config, card, tensors)
 
 
 def load_weights(path: str | Path, device: torch.device | str = "cpu") -> nn.Module:
@@ -107,7 +111,9 @@ def load_weights(path: str | Path, device: torch.device | str = "cpu") -> nn.Mod
     """
     stored = read_weights(path)
     warn_of_licence(Path(path).stem, str(stored.card.get("licence", "")))
-    model = build(stored.detector, stored.config)
+    held = sum(value.numel() for value in stored.tensors.values())
+    # what the file does not hold is refused before it takes memory; some buffers need not be in it
+    model = build(stored.detector, stored.config, most=2 * held + 1_000_000)
     fill(model, stored.tensors, str(path))
     return model.to(device).eval()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -16,6 +15,7 @@ from beambox.checks import BeamboxError, MissingFileError, how_to_install
 from beambox.detectors.contract import DetectorModel
 from beambox.geometry.boxes import wrap_angle
 from beambox.geometry.grid import VoxelGrid
+from beambox.io import parse_json
 from beambox.layers.coders import DIRECTION_OFFSET
 from beambox.layers.heads import AnchorPredictions
 from beambox.ops.voxelize import Voxels, voxelize
@@ -156,7 +156,7 @@ def read_about(session: Any) -> dict[str, Any]:
     held = session.get_modelmeta().custom_metadata_map
     if "beambox" not in held:
         raise BeamboxError(f'expected a file that beambox exported, with "beambox" in its metadata, got {sorted(held)}')
-    return json.loads(held["beambox"])
+    return parse_json(held["beambox"], "its metadata")
 
 
 def gathered(about: dict[str, Any], points: Tensor) -> Voxels:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from beambox.checks import BeamboxError, how_to_install
-from beambox.io import replacing
+from beambox.io import parse_json, replacing
 from beambox.structures import Detections
 
 __all__ = ["COLUMNS", "Journal", "done_in", "need_pyarrow", "rows_in", "write_parquet"]
@@ -85,7 +85,7 @@ def done_in(folder: Path) -> set[str]:
         with path.open("rb") as stream:
             for line in stream:
                 if line.startswith(DONE.encode()) and line.endswith(b"}\n"):
-                    done.add(json.loads(line)["done"])
+                    done.add(parse_json(line.decode(), str(path))["done"])
     return done
 
 
@@ -100,7 +100,7 @@ def rows_in(path: Path) -> Iterator[dict[str, Any]]:
                 yield from held
                 held = []
             else:
-                held.append(json.loads(line))
+                held.append(parse_json(line.decode(), str(path)))
 
 
 def write_parquet(journals: Sequence[Path], out: Path) -> int:
@@ -159,7 +159,7 @@ def _whole_part(path: Path) -> tuple[int, set[str]]:
                 raise BeamboxError(f"{path} is no journal of detections; give another folder")
             if line.startswith(DONE.encode()) and line.endswith(b"}\n"):
                 whole = place
-                done.add(json.loads(line)["done"])
+                done.add(parse_json(line.decode(), str(path))["done"])
     return whole, done
 
 

@@ -283,9 +283,9 @@ def _evaluate_class(
             flat, turned = _average(_table(rows, flags, rows.image, min_overlap, spared), oriented)
             image.append(flat)
             orientation.append(turned)
-    if not camera:
-        return ClassResult(name, min_overlap, tuple(objects), tuple(box3d), tuple(bev))
-    return ClassResult(name, min_overlap, tuple(objects), tuple(box3d), tuple(bev), tuple(image), tuple(orientation))
+    labelled = int((rows.truth_name == name.lower()).sum())
+    averages = (tuple(box3d), tuple(bev), tuple(image), tuple(orientation))  # the last two empty without a camera
+    return ClassResult(name, min_overlap, tuple(objects), *averages, labelled)
 
 
 def _flags(rows: _Rows, name: str, level: Difficulty, python_port: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -53,6 +53,8 @@ class ClassResult:
     """By the IoU in the image; empty without a camera."""
     orientation: tuple[AveragePrecision, ...] = ()
     """AOS: average orientation similarity, bounded by the AP in the image; empty without a camera."""
+    labelled: int = 0
+    """Ground-truth boxes of the class, whether they count at a level or not."""
 
     def metrics(self) -> list[tuple[str, tuple[AveragePrecision, ...]]]:
         """Return (name, averages) of the metrics that were computed."""
@@ -130,10 +132,19 @@ class KittiResult:
                 blocks = ([a.r40 for a in averages], [a.r11 for a in averages], [a.all_points for a in averages])
                 lines.append(f"{name:<5}" + "".join(_cells(block).rjust(columns + 2) for block in blocks))
             if not max(result.objects):
-                lines.append(f"     the labels have no {result.name}")
+                lines.append(f"     {_nothing_counts(result)}")
             elif min(result.objects) < 41:
                 lines.append(f"     fewer than 41 objects: R40 and R11 of {result.name} are capped, read `all`")
         return "\n".join(lines) + "\n"
+
+
+def _nothing_counts(result: ClassResult) -> str:
+    if not result.labelled:
+        return f"the labels have no {result.name}"
+    return (
+        f"the labels have {result.labelled} {result.name}, but none that KITTI's levels count (an image box of 25 "
+        "pixels or more, seen well enough): --no-difficulty counts every object"
+    )
 
 
 def _advice(graded: bool) -> list[str]:

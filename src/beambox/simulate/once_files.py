@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 from beambox.checks import BeamboxError
 from beambox.data.once import write_once_sequence, write_once_split
 from beambox.geometry.axes import Axes, turn_boxes
-from beambox.io import read_text
+from beambox.io import read_json
 from beambox.simulate.fleets import ONCE_FLEET
 from beambox.simulate.frames import simulate_frame
 from beambox.structures.frame import Frame
@@ -89,6 +88,6 @@ class OnceFiles:
         if not path.exists():
             return 0
         try:
-            return len(json.loads(read_text(path))["frames"])
+            return len(read_json(path)["frames"])
         except (ValueError, LookupError, TypeError) as error:
             raise BeamboxError(f"{path} is no sequence of ONCE ({error}); delete it or give another folder") from None

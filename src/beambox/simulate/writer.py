@@ -15,7 +15,7 @@ import numpy as np
 from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.kitti import write_kitti_frame, write_split
-from beambox.io import read_text, write_text
+from beambox.io import read_json, write_text
 from beambox.simulate.frames import VIEWS, simulate_frame
 from beambox.simulate.layouts import check_layout
 from beambox.simulate.once_files import OnceFiles
@@ -145,9 +145,9 @@ def _claim(out: Path, card: dict) -> None:
     path = out / _CARD
     if path.exists():
         try:
-            before = json.loads(read_text(path))
-        except json.JSONDecodeError as error:
-            raise BeamboxError(f"{path} is not JSON ({error}); delete the folder or give another") from None
+            before = read_json(path)
+        except BeamboxError as error:
+            raise BeamboxError(f"{error}; delete the folder or give another") from None
         before = {"files": "kitti", **before}  # cards of old name no layout
         for key, value in card.items():
             if before.get(key) != value:

@@ -17,7 +17,7 @@ from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
 from beambox.detectors.weights import load_weights
 from beambox.infer.evaluate import Detect, detect_frames, network, scored_frames
-from beambox.io import write_json
+from beambox.io import read_json, write_json
 from beambox.structures import Detections, Frame
 from beambox.train.config import Recipe, parse_recipe
 from beambox.train.loop import FINAL, LAST, train
@@ -116,7 +116,7 @@ def run_row(
     claim(folder, identity)
     scored = folder / "scores.json"
     if scored.is_file():
-        return json.loads(scored.read_text(encoding="utf-8"))
+        return read_json(scored)
     if not (folder / FINAL).is_file():
         objects = shared_database(plan, data, out)
         if not train(plan, data, folder, resume=(folder / LAST).exists(), shared_objects=objects).finished:
@@ -135,7 +135,7 @@ def claim(folder: Path, identity: dict[str, Any]) -> None:
     """
     path = folder / "recipe.json"
     if path.is_file():
-        held = json.loads(path.read_text(encoding="utf-8"))
+        held = read_json(path)
         differing = sorted(key for key in {*held, *identity} if held.get(key) != identity.get(key))
         if differing:
             raise BeamboxError(

@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.io import write_bytes
+from beambox.io import parse_json, write_bytes
 
 __all__ = ["Checkpoint", "load_checkpoint", "optimizer_state", "part", "restore_module", "restore_optimizer"]
 
@@ -81,8 +81,11 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except SafetensorError as error:
         raise BeamboxError(f"{path} is damaged or cut short ({error}); resume from another checkpoint") from None
-    plain = json.loads(metadata["beambox"])
-    return Checkpoint(tensors, plain["step"], plain["recipe"], plain["detector"], plain["state"])
+    plain = parse_json(metadata.get("beambox", "null"), str(path))
+    try:
+        return Checkpoint(tensors, plain["step"], plain["recipe"], plain["detector"], plain["state"])
+    except (LookupError, TypeError):
+        raise BeamboxError(f"{path} is a damaged checkpoint: its header lacks a part; resume from another") from None
 
 
 def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.augment import AugmentConfig
+from beambox.io import parse_yaml, read_text
 from beambox.metrics.once import SUPERCLASSES
 from beambox.train.recipes import find_recipe
 
@@ -87,7 +87,7 @@ class AugmentSection(AugmentConfig):
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-    sample: dict[str, Annotated[int, Field(ge=0)]] = Field(default_factory=dict)
+    sample: dict[str, Annotated[int, Field(ge=0, le=1000)]] = Field(default_factory=dict)
     """Objects drawn from the database a frame, by class, in the order of drawing."""
     object_min_points: int = Field(default=5, ge=1)
     """Objects with fewer LiDAR points do not enter the database."""
@@ -104,7 +104,7 @@ class OptimSection(Section):
     """Passes over the data; give this or ``iterations``."""
     iterations: int | None = Field(default=None, gt=0)
     """Number of optimiser steps; give this or ``epochs``."""
-    batch: int = Field(default=4, gt=0)
+    batch: int = Field(default=4, gt=0, le=4096)
     """Frames in one optimiser step, over all processes together."""
     schedule: Literal["one-cycle", "cosine", "constant"] = "one-cycle"
     """``one-cycle`` rises from lr/10, falls to lr/100000; ``cosine`` rises over ``warmup`` and falls to 0."""
@@ -189,7 +189,7 @@ class Recipe(Section):
     """Scoring during the run; null for none."""
     ema: EmaSection | None = EmaSection()
     """Averaging of the weights; null for none."""
-    batchnorm_batches: int = Field(default=60, ge=0)
+    batchnorm_batches: int = Field(default=60, ge=0, le=1_000_000)
     """Before each validation and export the batch norms' statistics are measured anew, exactly, over the batches of
     this many last steps, for the weights that are scored and written; 0 keeps the moving averages of training."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
@@ -199,9 +199,9 @@ class Recipe(Section):
     fully convolutional detectors on a CPU. Multiples of 8; null for the whole grid."""
     seed: int = 0
     """Of initial weights, order of frames, augmentation and windows."""
-    workers: int = Field(default=1, ge=0)
+    workers: int = Field(default=1, ge=0, le=1024)
     """Processes that prepare data in the background; 0 prepares it in the training process."""
-    threads: int | None = Field(default=None, gt=0)
+    threads: int | None = Field(default=None, gt=0, le=1024)
     """Threads of torch; null leaves torch's choice."""
     compile: bool = False
     """Compile the dense layers with torch.compile (needs a C++ compiler on a CPU)."""
@@ -242,10 +242,7 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
 def load_recipe(path: str | Path) -> dict[str, Any]:
     """Return the plain values of a recipe, given by its name or file; unchecked but for being a mapping."""
     path = find_recipe(path)
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise BeamboxError(f"recipe {path} is not valid YAML: {' '.join(str(error).split())}") from None
+    values = parse_yaml(read_text(path), f"recipe {path}")
     if not isinstance(values, dict):
         raise BeamboxError(f"recipe {path} must be a mapping of keys to values, got {type(values).__name__}")
     return values
@@ -282,10 +279,7 @@ def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict
         key, equals, text = override.partition("=")
         if not equals or not key:
             raise BeamboxError(f'`--set` takes key=value as in optim.lr=0.001, got "{override}"')
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise BeamboxError(f'the value of `--set {key}` is not valid YAML: "{text}"') from None
+        value = parse_yaml(text, f'the value of `--set {key}`, "{text[:60]}",')
         if isinstance(value, str):
             value = _number(value)
         *parents, last = key.split(".")

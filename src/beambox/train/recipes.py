@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from beambox.checks import MissingFileError, did_you_mean
+from beambox.io import read_yaml
 
 __all__ = ["AUDIENCES", "ShippedRecipe", "find_recipe", "list_recipes", "recipe_files"]
 
@@ -51,7 +50,7 @@ def list_recipes() -> list[ShippedRecipe]:
     """Read what each shipped recipe says of itself, in the order of :data:`AUDIENCES`."""
     found = []
     for name, path in recipe_files().items():
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = read_yaml(path)
         stages = tuple(values.get("stages") or ())
         texts = (values["description"], values["takes"], values["ran"])
         found.append(ShippedRecipe(name, path.parent.name, path, *texts, stages))

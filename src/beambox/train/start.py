@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from torch import nn
 from beambox.checks import BeamboxError
 from beambox.detectors.catalogue import build, tensors_since
 from beambox.detectors.renames import current_fields
-from beambox.detectors.weights import WeightFile, read_weights
+from beambox.detectors.weights import WeightFile, read_weights, warn_of_licence
 from beambox.infer.predictor import find_weights
 from beambox.train.config import DetectorSection
 
@@ -39,6 +40,7 @@ def build_detector(section: DetectorSection, seed: int) -> tuple[nn.Module, list
         raise BeamboxError(
             f"detector.start_from: {section.start_from} holds a {stored.detector}, the recipe trains a {section.name}"
         )
+    warn_of_licence(Path(section.start_from).stem, str(stored.card.get("licence", "")))
     detector = _fresh(section.name, _over(current_fields(stored.config), current_fields(section.options)), seed)
     return detector, take_over(detector, stored, section.start_from)
 

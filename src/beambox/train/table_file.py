@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from beambox.checks import BeamboxError, MissingFileError
+from beambox.io import read_yaml
 from beambox.train.table import Row, Table, levels
 
 __all__ = ["TableFile", "read_table"]
@@ -37,9 +37,7 @@ def read_table(path: Path) -> Table:
     if not path.is_file():
         raise MissingFileError(f"--table: there is no file {path}")
     try:
-        given = TableFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BeamboxError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+        given = TableFile.model_validate(read_yaml(path))
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, one['loc'])) or 'the file'}: {one['msg']}" for one in error.errors()]
         raise BeamboxError(f"{path}: {'; '.join(faults)}") from None

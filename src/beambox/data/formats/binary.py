@@ -110,7 +110,8 @@ def _explained(kinds: np.ndarray, period: int) -> float:
 def _implausible(numbers: np.ndarray) -> bool:
     """Tell whether more than a tenth of the numbers cannot be metres (NaN may be: sensors write it for no return)."""
     sample = numbers[:: max(1, len(numbers) // 2000)]
-    magnitude = np.abs(sample.astype(np.float64))
+    with np.errstate(invalid="ignore"):  # signalling NaNs, in bytes that are no float32
+        magnitude = np.abs(sample.astype(np.float64))
     wrong = (magnitude > FARTHEST) | ((magnitude < 1e-20) & (magnitude > 0))
     return bool(wrong.sum() > 0.1 * wrong.size)
 

@@ -16,11 +16,13 @@ from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.formats.columns import Columns, decode, library
 from beambox.data.formats.kept import kept_open
 from beambox.data.formats.point_cloud2 import cloud_columns
+from beambox.data.formats.unpacking import bound_rosbags
 from beambox.io import check_file_name
 
 __all__ = ["ENDINGS", "read_message", "recording_of", "sweeps_in"]
 
 ENDINGS = (".bag", ".mcap", ".db3")
+LOW_LEVEL = ("rosbag1.reader", "rosbag2.reader", "rosbag2.storage_mcap")
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 STAMP = re.compile(r"([0-9]{1,19})(?:-([0-9]{1,9}))?")
 
@@ -125,4 +127,5 @@ def _reader(root: Path) -> Any:
     """Make a reader of a recording; older ones, without definitions of their types, hold ROS 2's own."""
     highlevel = library("rosbags.highlevel", root, "recordings")
     typesys = library("rosbags.typesys", root, "recordings")
+    bound_rosbags(*(library(f"rosbags.{name}", root, "recordings") for name in LOW_LEVEL))
     return highlevel.AnyReader([root], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
