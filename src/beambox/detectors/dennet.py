@@ -63,6 +63,7 @@ from beambox.layers.bev import (
     deconv_bn_relu,
     enlarge_and_join,
     expect_levels_meet,
+    mean_over,
 )
 from beambox.layers.encoders import mean_voxels
 from beambox.layers.heads import PostProcess
@@ -523,8 +524,8 @@ class CoordinateAttention(nn.Module):
         """Return ``bev`` weighed, of the same shape."""
         expect_shape("bev", bev, (None, self.channels, None, None))
         height, width = bev.shape[-2:]
-        rows = bev.mean(dim=3, keepdim=True)  # (B, C, H, 1)
-        columns = bev.mean(dim=2, keepdim=True).transpose(2, 3)  # (B, C, W, 1)
+        rows = mean_over(bev, 3)  # (B, C, H, 1)
+        columns = mean_over(bev, 2).transpose(2, 3)  # (B, C, W, 1)
         hidden = self.shared(torch.cat((rows, columns), dim=2))  # (B, m, H + W, 1)
         rows, columns = hidden.split((height, width), dim=2)
         by_row = torch.sigmoid(self.rows(rows))  # (B, C, H, 1)
