@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What the Makefile does, on every system and without make: python make.py demo | test | test-slow | check | ...
+"""What the Makefile does, on every system and without make: python make.py demo | test | docs | check | ...
 
 Needs Python 3.10 or later and nothing else; everything goes into .venv, beside this file.
 """
@@ -34,7 +34,7 @@ def pip(*words: str) -> None:
     run("-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", str(CONSTRAINTS), *words)
 
 
-def setup(extras: str = "train,formats", marker: str = ".ready") -> None:
+def setup(extras: str = "train,formats,plots", marker: str = ".ready") -> None:
     """Make the environment and install this checkout into it; does nothing where both are up to date."""
     done = VENV / marker
     inputs = (HERE / "pyproject.toml", CONSTRAINTS)
@@ -74,6 +74,12 @@ def test_slow() -> None:
     run("-m", "pytest", "-m", "slow")
 
 
+def docs() -> None:
+    """Build the site from docs/ into site/, offline; a broken link or a page made from older code fails."""
+    setup("dev", ".ready-dev")
+    run("docs/make_site.py")
+
+
 def constraints() -> None:
     """Write constraints.txt anew: for Python 3.10 and later on all systems, keeping each version that still fits.
 
@@ -92,7 +98,7 @@ def constraints() -> None:
 
 def clean() -> None:
     """Remove what these commands made."""
-    for name in (".venv", "demo", "build", "dist"):
+    for name in (".venv", "demo", "build", "dist", "site"):
         shutil.rmtree(HERE / name, ignore_errors=True)
 
 
@@ -102,6 +108,7 @@ TASKS = {
     "check": check,
     "test": test,
     "test-slow": test_slow,
+    "docs": docs,
     "constraints": constraints,
     "clean": clean,
 }

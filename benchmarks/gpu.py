@@ -119,36 +119,36 @@ class Session:
     def group(self, group: Group) -> None:
         """Run one group, in a new process after each item that took the process with it."""
         limit = group.seconds * (10 if self.arguments.device == "cpu" else 1)
-        told: dict[str, Any] = {"items": {}}
+        details: dict[str, Any] = {"items": {}}
         with self.lock:
-            self.report["groups"][group.name] = told
+            self.report["groups"][group.name] = details
         if self.left() < 10:
-            told["skipped"] = "no time left"
+            details["skipped"] = "no time left"
             self.say(f"{group.name}: no time left")
             self.write()
             return
         start = time.monotonic()
         deadline = min(start + limit, self.end)
         for attempt in range(4):
-            lost = self.process(group, told, deadline)
+            lost = self.process(group, details, deadline)
             if lost is None:
                 break
-            told["items"][lost["item"]] = {"error": lost["error"]}
+            details["items"][lost["item"]] = {"error": lost["error"]}
             self.say(f"{group.name}: {lost['item']}: {lost['error']}")
             if time.monotonic() > deadline - 10 or attempt == 3:
                 break
-        told["seconds"] = round(time.monotonic() - start, 1)
-        failed = [name for name, item in told["items"].items() if "error" in item or item.get("ok") is False]
+        details["seconds"] = round(time.monotonic() - start, 1)
+        failed = [name for name, item in details["items"].items() if "error" in item or item.get("ok") is False]
         self.say(
-            f"{group.name}: {len(told['items'])} items in {told['seconds']} s"
+            f"{group.name}: {len(details['items'])} items in {details['seconds']} s"
             + (f", FAILED: {', '.join(failed)}" if failed else "")
         )
         self.write()
 
-    def process(self, group: Group, told: dict[str, Any], deadline: float) -> dict[str, str] | None:
+    def process(self, group: Group, details: dict[str, Any], deadline: float) -> dict[str, str] | None:
         """Run what is left of a group in a process; return the item it was lost on, if it was."""
         command = [sys.executable, str(Path(__file__).with_name("gpu_items.py")), "--group", group.name]
-        command += ["--device", self.arguments.device, "--frames", str(self.frames), "--skip", *told["items"]]
+        command += ["--device", self.arguments.device, "--frames", str(self.frames), "--skip", *details["items"]]
         command += ["--quick"] * self.arguments.quick
         paths = [str(ROOT / "src"), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "PYTHONUNBUFFERED": "1"}
@@ -169,7 +169,7 @@ class Session:
             heard = json.loads(line[len(MARK) :])
             current = heard.pop("item")
             if heard:
-                told["items"][current] = heard
+                details["items"][current] = heard
                 if "error" in heard:
                     self.say(f"{group.name}: {current}: {heard['error']}")
                 self.write()
@@ -179,7 +179,7 @@ class Session:
         if code == 0:
             return None
         why = "time limit" if timed_out else f"the process ended with code {code}: {last[-300:]}"
-        if current in told["items"] and not timed_out:
+        if current in details["items"] and not timed_out:
             current = f"after {current}"
         return {"item": current, "error": why}
 

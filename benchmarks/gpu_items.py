@@ -63,9 +63,9 @@ class Setting:
         return frames
 
 
-def tell(item: str, **told: Any) -> None:
+def tell(item: str, **details: Any) -> None:
     """Report; without anything told, that the item begins."""
-    print(MARK + json.dumps({"item": item, **told}), flush=True)
+    print(MARK + json.dumps({"item": item, **details}), flush=True)
 
 
 def run(items: Sequence[Item], skip: Sequence[str], device: str) -> int:
@@ -76,7 +76,7 @@ def run(items: Sequence[Item], skip: Sequence[str], device: str) -> int:
         tell(name)
         start = time.perf_counter()
         try:
-            told = work()
+            details = work()
             synchronize(device)
         except Exception as error:
             traceback.print_exc()
@@ -87,7 +87,7 @@ def run(items: Sequence[Item], skip: Sequence[str], device: str) -> int:
             except Exception:
                 return LOST
         else:
-            tell(name, **told, took=round(time.perf_counter() - start, 2))
+            tell(name, **details, took=round(time.perf_counter() - start, 2))
     return 0
 
 
@@ -108,18 +108,18 @@ def environment(setting: Setting) -> list[Item]:
 
         import torch
 
-        told: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count()}
+        details: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count()}
         for name in ("torch", "triton", "numpy", "numba", "pydantic", "lightning-fabric"):
             try:
-                told[name] = version(name)
+                details[name] = version(name)
             except PackageNotFoundError:
-                told[name] = None
-        told["threads"] = torch.get_num_threads()
+                details[name] = None
+        details["threads"] = torch.get_num_threads()
         if setting.device == "cuda":
             properties = torch.cuda.get_device_properties(0)
-            told |= {"gpu": properties.name, "memory_gb": round(properties.total_memory / 1e9, 1)}
-            told |= {"multiprocessors": properties.multi_processor_count, "cuda": torch.version.cuda}
-        return told
+            details |= {"gpu": properties.name, "memory_gb": round(properties.total_memory / 1e9, 1)}
+            details |= {"multiprocessors": properties.multi_processor_count, "cuda": torch.version.cuda}
+        return details
 
     def package() -> dict[str, Any]:
         import beambox

@@ -14,13 +14,13 @@ LIMIT = {torch.float64: 1e-10, torch.float32: 1e-4, torch.bfloat16: 2e-2, torch.
 """Largest error, relative to the norm of the reference."""
 
 
-def error(got: Tensor, want: Tensor) -> float:
+def error(actual: Tensor, want: Tensor) -> float:
     """Return the norm of the difference over the norm of the reference; NaN passes nothing."""
-    got, want = got.detach().cpu().double(), want.detach().cpu().double()
-    if got.shape != want.shape:
-        raise AssertionError(f"shape {tuple(got.shape)}, reference {tuple(want.shape)}")
+    actual, want = actual.detach().cpu().double(), want.detach().cpu().double()
+    if actual.shape != want.shape:
+        raise AssertionError(f"shape {tuple(actual.shape)}, reference {tuple(want.shape)}")
     size = float(want.norm())
-    return float((got - want).norm()) / (size or 1.0)
+    return float((actual - want).norm()) / (size or 1.0)
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -34,12 +34,12 @@ def compare(
     """Run ours on the device and its twin on the CPU in float64; compare outputs and gradients by every input."""
     mine = [value.detach().to(device, copy=True).requires_grad_() for value in inputs]
     theirs = [value.detach().double().clone().requires_grad_() for value in inputs]
-    got, want = ours(*mine), twin(*theirs)
-    errors = {"forward": error(got, want)}
+    actual, want = ours(*mine), twin(*theirs)
+    errors = {"forward": error(actual, want)}
     if want.numel() and want.requires_grad:
         cotangent = torch.randn(want.shape, generator=seeded(5), dtype=torch.float64)
-        got.backward(cotangent.to(got))
-        want.backward(cotangent.to(got.dtype).double())
+        actual.backward(cotangent.to(actual))
+        want.backward(cotangent.to(actual.dtype).double())
         for place, (a, b) in enumerate(zip(mine, theirs)):
             assert a.grad is not None and b.grad is not None
             errors[f"gradient {place}"] = error(a.grad, b.grad)
@@ -47,24 +47,24 @@ def compare(
     return {"ok": worst <= limit, "worst": worst, "limit": limit, "errors": errors}
 
 
-def exact(got: Tensor, want: Tensor) -> dict[str, Any]:
+def exact(actual: Tensor, want: Tensor) -> dict[str, Any]:
     """Compare whole numbers."""
-    got, want = got.cpu(), want.cpu()
-    if got.shape != want.shape:
-        return {"ok": False, "shapes": [list(got.shape), list(want.shape)]}
-    wrong = int((got != want).sum())
+    actual, want = actual.cpu(), want.cpu()
+    if actual.shape != want.shape:
+        return {"ok": False, "shapes": [list(actual.shape), list(want.shape)]}
+    wrong = int((actual != want).sum())
     return {"ok": wrong == 0, "wrong": wrong, "of": want.numel()}
 
 
 def scatter(setting: Setting) -> list[Item]:
     """Reductions over groups of rows."""
-    from beambox.ops import scatter as door
+    from beambox.ops import scatter as frontend
     from beambox.ops.scatter import reference
 
-    doors = {
-        "sum": (door.segment_sum, reference.segment_sum),
-        "mean": (door.segment_mean, reference.segment_mean),
-        "max": (door.segment_max, reference.segment_max),
+    frontends = {
+        "sum": (frontend.segment_sum, reference.segment_sum),
+        "mean": (frontend.segment_mean, reference.segment_mean),
+        "max": (frontend.segment_max, reference.segment_max),
     }
     sizes = ((0, 3, 4), (1, 1, 1), (40, 7, 13), (30, 130, 4), (5000, 64, 1200))
 
@@ -72,14 +72,14 @@ def scatter(setting: Setting) -> list[Item]:
         values = torch.randn(rows, columns, generator=seeded(rows)).to(dtype)
         values = torch.where(torch.rand(rows, columns, generator=seeded(1)) < 0.3, 0.5, values)  # ties
         segment = torch.randint(0, max(size, 1), (rows,), generator=seeded(2))
-        ours, twin = doors[name]
+        ours, twin = frontends[name]
         on_device = segment.to(setting.device)
         return compare(
             lambda v: ours(v, on_device, size), lambda v: twin(v, segment, size), [values], setting.device, LIMIT[dtype]
         )
 
     items: list[Item] = []
-    for name in doors:
+    for name in frontends:
         for dtype in (torch.float32, torch.float64, torch.bfloat16):
             for size in sizes:
                 if dtype == torch.bfloat16 and name == "mean" and size[0] == 5000:
@@ -92,7 +92,7 @@ def scatter(setting: Setting) -> list[Item]:
         features = torch.randn(500, 64, generator=seeded(4))
         there = cells.to(setting.device)
         return compare(
-            lambda f: door.scatter_bev(f, there, 2, (30, 40)),
+            lambda f: frontend.scatter_bev(f, there, 2, (30, 40)),
             lambda f: reference.scatter_bev(f, cells, 2, (30, 40)),
             [features],
             setting.device,
@@ -104,7 +104,7 @@ def scatter(setting: Setting) -> list[Item]:
 
 def boxes(setting: Setting) -> list[Item]:
     """Overlaps, suppression, points in boxes."""
-    from beambox.ops import rotated_iou as door
+    from beambox.ops import rotated_iou as frontend
     from beambox.ops.nms import nms
     from beambox.ops.nms import reference as plain_nms
     from beambox.ops.points_in_boxes import points_in_boxes, points_in_boxes_mask
@@ -118,16 +118,16 @@ def boxes(setting: Setting) -> list[Item]:
         a, b = random_boxes(max(rows, 1), seeded(1), 4), random_boxes(max(columns, 1), seeded(2), 4)
         b[0] = a[0]
         a, b = a[:rows], b[:columns]
-        got = getattr(door, name)(a.to(device), b.to(device)).cpu()
+        actual = getattr(frontend, name)(a.to(device), b.to(device)).cpu()
         want = getattr(reference, name)(a, b)
-        worst = float((got - want).abs().max()) if want.numel() else 0.0
-        return {"ok": got.shape == want.shape and worst < 1e-8, "worst": worst, "limit": 1e-8}
+        worst = float((actual - want).abs().max()) if want.numel() else 0.0
+        return {"ok": actual.shape == want.shape and worst < 1e-8, "worst": worst, "limit": 1e-8}
 
     def suppress(count: int, threshold: float, pre: int, post: int) -> dict[str, Any]:
         given = random_boxes(count, seeded(count), 30, torch.float32) if count else torch.zeros(0, 7)
         scores = torch.rand(count, generator=seeded(3))
-        got = nms(given.to(device), scores.to(device), threshold, pre, post)
-        return {**exact(got, plain_nms.nms(given, scores, threshold, pre, post)), "kept": len(got)}
+        actual = nms(given.to(device), scores.to(device), threshold, pre, post)
+        return {**exact(actual, plain_nms.nms(given, scores, threshold, pre, post)), "kept": len(actual)}
 
     def inside(mask: bool) -> dict[str, Any]:
         points, given = fan(3000, seeded(1)), random_boxes(20, seeded(2), 30, torch.float32)
@@ -164,26 +164,26 @@ def boxes(setting: Setting) -> list[Item]:
 def sparse_conv(setting: Setting) -> list[Item]:
     """Sparse convolutions: maps, products, gradients."""
     from beambox.layers.encoders import mean_voxels
-    from beambox.ops.sparse_conv import Geometry, SparseTensor, kernel_map, reference, sparse_conv3d, submanifold_conv3d
+    from beambox.ops.sparse_conv import ConvSpec, SparseTensor, kernel_map, reference, sparse_conv3d, submanifold_conv3d
     from beambox.ops.sparse_conv import inverse_conv3d as back
     from beambox.ops.sparse_conv.pairs import input_rows
     from beambox.ops.voxelize import voxelize
     from oracles.sparse_conv import random_sparse
 
     device = setting.device
-    kinds = {"submanifold": Geometry.centred((3, 3, 3)), "strided": Geometry((3, 3, 3), (2, 2, 2), (1, 1, 1))}
-    kinds["uneven"] = Geometry((3, 1, 2), (2, 1, 2), (0, 0, 1))
+    kinds = {"submanifold": ConvSpec.centered((3, 3, 3)), "strided": ConvSpec((3, 3, 3), (2, 2, 2), (1, 1, 1))}
+    kinds["uneven"] = ConvSpec((3, 1, 2), (2, 1, 2), (0, 0, 1))
 
     def there(x: SparseTensor, dtype: torch.dtype) -> SparseTensor:
         return SparseTensor.of(x.features.to(device, dtype), x.indices.to(device), x.shape, x.batch_size)
 
     def case(kind: str, dtype: torch.dtype, density: float, c_in: int, c_out: int, inverse: bool) -> dict[str, Any]:
-        geometry = kinds[kind]
+        spec = kinds[kind]
         x = random_sparse(1, (7, 9, 8), 2, density, c_in, torch.float32)
-        kernel = torch.randn((*geometry.kernel, c_in, c_out), generator=seeded(2)) / (3 * c_in**0.5)
+        kernel = torch.randn((*spec.kernel, c_in, c_out), generator=seeded(2)) / (3 * c_in**0.5)
         bias = torch.randn(c_out, generator=seeded(3))
         values, kernel, bias = (t.to(dtype) for t in (x.features, kernel, bias))
-        how = (geometry.stride, geometry.padding)
+        how = (spec.stride, spec.padding)
 
         def run(sparse: SparseTensor, f: Tensor, w: Tensor, b: Tensor) -> Tensor:
             given = sparse.with_features(f)
@@ -207,13 +207,13 @@ def sparse_conv(setting: Setting) -> list[Item]:
         x = random_sparse(4, (9, 20, 21), 3, 0.1, 1, torch.float32, empty=(1,))
         here = there(x, torch.float32)
         results = []
-        for geometry in kinds.values():
-            got, want = kernel_map(here.sites, geometry), kernel_map(x.sites, geometry)
+        for spec in kinds.values():
+            actual, want = kernel_map(here.sites, spec), kernel_map(x.sites, spec)
             results += [
-                exact(got.target.indices, want.target.indices),
-                exact(got.kept(input_rows), want.kept(input_rows)),
+                exact(actual.target.indices, want.target.indices),
+                exact(actual.kept(input_rows), want.kept(input_rows)),
             ]
-            results += [exact(got.inverse.kept(input_rows), want.inverse.kept(input_rows))]
+            results += [exact(actual.inverse.kept(input_rows), want.inverse.kept(input_rows))]
         return {"ok": all(r["ok"] for r in results), "parts": results}
 
     def sweep(dtype: torch.dtype) -> dict[str, Any]:
@@ -221,11 +221,11 @@ def sparse_conv(setting: Setting) -> list[Item]:
 
         batch = setting.batch(1)
         voxels = mean_voxels(voxelize(batch.points, batch.sample, 1, KITTI_VOXELS, 5, 40000))
-        geometry = kinds["submanifold"]
+        spec = kinds["submanifold"]
         values = torch.randn(len(voxels.features), 64, generator=seeded(6)).to(dtype)
         weight = (torch.randn((27, 64, 64), generator=seeded(7)) / 24).to(dtype)
         here = there(replace(voxels, features=values.float()), dtype)
-        pairs, plain = kernel_map(here.sites, geometry), kernel_map(voxels.sites, geometry)
+        pairs, plain = kernel_map(here.sites, spec), kernel_map(voxels.sites, spec)
         from beambox.ops.sparse_conv import _convolve
 
         return {"voxels": len(values)} | compare(
@@ -291,22 +291,22 @@ def density(setting: Setting) -> list[Item]:
     def count(voxels: int, levels: int, radius: float) -> dict[str, Any]:
         index = torch.stack([torch.randint(0, n, (voxels,), generator=seeded(n)) for n in (2, levels, 40, 41)], dim=1)
         index[:, 1] -= 7
-        got = ball_count(index.to(setting.device), (0.1, 0.1, 0.15), radius)
-        return exact(got, plain_count.ball_count(index, (0.1, 0.1, 0.15), radius))
+        actual = ball_count(index.to(setting.device), (0.1, 0.1, 0.15), radius)
+        return exact(actual, plain_count.ball_count(index, (0.1, 0.1, 0.15), radius))
 
     def query(points: int, density: float, samples: int) -> dict[str, Any]:
         shape = (9, 40, 44)
         active = torch.nonzero(torch.rand((2, *shape), generator=seeded(1)) < density)
         active = active[torch.randperm(len(active), generator=seeded(2))]
         size = torch.tensor([0.4, 0.4, 0.8])
-        centres = (active[:, 1:].flip(1) + 0.5) * size
+        centers = (active[:, 1:].flip(1) + 0.5) * size
         where = torch.rand(points, 3, generator=seeded(3)) * 20 - torch.tensor([1.0, 1.0, 5.0])
         cells = torch.cat((torch.arange(points)[:, None] % 2, (where / size).floor().long().flip(1)), dim=1)
         cells = cells[cells[:, 0].argsort(stable=True)]
-        there = [t.to(setting.device) for t in (where, cells, active, centres)]
-        got = voxel_query(there[0], there[1], Sites.of(there[2], shape, 2), there[3], (2, 3, 3), 1.2, samples)
+        there = [t.to(setting.device) for t in (where, cells, active, centers)]
+        actual = voxel_query(there[0], there[1], Sites.of(there[2], shape, 2), there[3], (2, 3, 3), 1.2, samples)
         sites = Sites.of(active, shape, 2)
-        return exact(got, plain_query.voxel_query(where, cells, sites, centres, (2, 3, 3), 1.2, samples))
+        return exact(actual, plain_query.voxel_query(where, cells, sites, centers, (2, 3, 3), 1.2, samples))
 
     counts = ((1, 5, 0.3), (100, 40, 0.15), (2000, 40, 0.3), (3000, 130, 0.6))
     queries = ((1, 0.2, 16), (0, 0.1, 4), (500, 0.0, 4), (3000, 0.02, 16), (3000, 0.3, 5))
@@ -329,9 +329,9 @@ def voxels(setting: Setting) -> list[Item]:
         if count > 10:
             points[3, 1], points[4, 0] = torch.nan, torch.inf
         sample = torch.arange(count) // (count // 3 + 1)
-        got = voxelize(points.to(setting.device), sample.to(setting.device), 3, grid, max_points, max_voxels)
+        actual = voxelize(points.to(setting.device), sample.to(setting.device), 3, grid, max_points, max_voxels)
         want = reference.voxelize(points, sample, 3, grid, max_points, max_voxels)
-        parts = [exact(getattr(got, n), getattr(want, n)) for n in ("points", "voxel", "count", "index")]
+        parts = [exact(getattr(actual, n), getattr(want, n)) for n in ("points", "voxel", "count", "index")]
         return {"ok": all(part["ok"] for part in parts), "parts": parts}
 
     return [

@@ -32,7 +32,7 @@ def recipe_of(name: str) -> Any:
 
 def full_width(name: str) -> nn.Module:
     """Build a detector as its recipe for KITTI has it, with random weights that let a sweep through."""
-    from beambox.detectors.catalogue import build
+    from beambox.detectors.catalog import build
 
     torch.manual_seed(0)
     recipe = recipe_of(name)
@@ -83,20 +83,20 @@ def model_of(name: str, setting: Setting, shipped: bool) -> Any:
     return model
 
 
-def agreement(got: Any, want: Any) -> dict[str, Any]:
+def agreement(actual: Any, want: Any) -> dict[str, Any]:
     """Compare detections of one sample: each of ours has its nearest reference of the same class."""
-    told: dict[str, Any] = {"count": [len(got), len(want)]}
-    if not len(got) or not len(want):
-        return told | {"ok": len(got) == len(want)}
-    got = got.to("cpu")
-    distance = (got.boxes[:, None] - want.boxes[None]).abs().amax(dim=2)
-    distance = torch.where(got.class_ids[:, None] == want.class_ids[None], distance, torch.inf)
+    details: dict[str, Any] = {"count": [len(actual), len(want)]}
+    if not len(actual) or not len(want):
+        return details | {"ok": len(actual) == len(want)}
+    actual = actual.to("cpu")
+    distance = (actual.boxes[:, None] - want.boxes[None]).abs().amax(dim=2)
+    distance = torch.where(actual.class_ids[:, None] == want.class_ids[None], distance, torch.inf)
     nearest, row = distance.min(dim=1)
     same = nearest < 1e-2
-    told["matched"] = int(same.sum())
-    told["boxes"] = float(nearest[same].max()) if bool(same.any()) else None
-    told["scores"] = float((got.scores - want.scores[row])[same].abs().max()) if bool(same.any()) else None
-    return told | {"ok": len(got) == len(want) and bool(same.all())}
+    details["matched"] = int(same.sum())
+    details["boxes"] = float(nearest[same].max()) if bool(same.any()) else None
+    details["scores"] = float((actual.scores - want.scores[row])[same].abs().max()) if bool(same.any()) else None
+    return details | {"ok": len(actual) == len(want) and bool(same.all())}
 
 
 def detections(name: str, setting: Setting, shipped: bool) -> dict[str, Any]:
@@ -108,17 +108,17 @@ def detections(name: str, setting: Setting, shipped: bool) -> dict[str, Any]:
         want = model(batch)
         found = model.decode(want)
         there = model.to(setting.device)
-        got = there(batch.to(setting.device))
-        ours = there.decode(got)
+        actual = there(batch.to(setting.device))
+        ours = there.decode(actual)
     errors = {
         part: error(a, b)
-        for (part, a), (_, b) in zip(tensors(got), tensors(want))
+        for (part, a), (_, b) in zip(tensors(actual), tensors(want))
         if a.is_floating_point() and a.shape == b.shape
     }
-    told = agreement(ours[0], found[0])
+    details = agreement(ours[0], found[0])
     first = [value for part, value in errors.items() if not part.startswith(("rois", "refined", "levels"))]
-    return {**told, "worst": max(first, default=0.0), "limit": 1e-3, "errors": errors} | {
-        "ok": told["ok"] and max(first, default=0.0) < 1e-3
+    return {**details, "worst": max(first, default=0.0), "limit": 1e-3, "errors": errors} | {
+        "ok": details["ok"] and max(first, default=0.0) < 1e-3
     }
 
 
@@ -133,9 +133,9 @@ def lower_precision(name: str, setting: Setting, shipped: bool) -> dict[str, Any
         detector = Detector(model, device=setting.device, precision=precision)
         with torch.inference_mode():
             found[precision] = detector.model.decode(detector.predict(batch))[0].to("cpu")
-    told = agreement(found["bfloat16"], found["float32"])
-    told.pop("ok")
-    return told
+    details = agreement(found["bfloat16"], found["float32"])
+    details.pop("ok")
+    return details
 
 
 def learnt(model: Any, batch: Any, grid: Any) -> tuple[dict[str, float], dict[str, Tensor]]:
@@ -166,10 +166,10 @@ def losses(name: str, setting: Setting, dtype: torch.dtype) -> dict[str, Any]:
     grid = whole.window((0, (whole.size[1] - cells[1]) // 2 // 8 * 8), cells)
     batch = dataclasses.replace(batch, points=batch.points.to(dtype))
     want, theirs = learnt(model, batch, grid)
-    got, ours = learnt(model.to(setting.device), batch.to(setting.device), grid)
+    actual, ours = learnt(model.to(setting.device), batch.to(setting.device), grid)
     tight = dtype == torch.float64
     judged = [k for k in theirs if tight or not k.startswith("roi_")]
-    off = {k: abs(got[k] - want[k]) / max(abs(want[k]), 1e-6) for k in want if tight or not k.startswith("roi_")}
+    off = {k: abs(actual[k] - want[k]) / max(abs(want[k]), 1e-6) for k in want if tight or not k.startswith("roi_")}
     # Where a gradient is the difference of large terms (weights before a batch norm), rounding is all there is.
     norms = {k: float(theirs[k].norm()) for k in judged}
     wrong = {k: error(ours[k], theirs[k]) for k in judged if norms[k] > 1e-3 * max(norms.values())}
@@ -179,7 +179,7 @@ def losses(name: str, setting: Setting, dtype: torch.dtype) -> dict[str, Any]:
         "ok": max(off.values()) < limit and set(ours) == set(theirs) and max(wrong.values()) < limit,
         "worst": max(wrong.values()),
         "limit": limit,
-        "losses": {k: [got[k], want[k]] for k in want},
+        "losses": {k: [actual[k], want[k]] for k in want},
         "gradients": {k: wrong[k] for k in worst},
     }
 
@@ -232,5 +232,5 @@ def pytest(paths: list[str], variables: dict[str, str], setting: Setting) -> dic
             text = re.sub(r"\s+", " ", fault.get("message") or "")
             failed.append(f"{case.get('classname')}::{case.get('name')}: {text[:200]}")
     skipped = sum(case.find("skipped") is not None for case in cases)
-    told = {"ok": not failed and bool(cases), "passed": len(cases) - len(failed) - skipped, "skipped": skipped}
-    return told | {"failed": failed[:60]}
+    details = {"ok": not failed and bool(cases), "passed": len(cases) - len(failed) - skipped, "skipped": skipped}
+    return details | {"failed": failed[:60]}

@@ -236,7 +236,7 @@ def counted(subject: Subject, batch: Any) -> dict[str, Any]:
 
 def waiting_places(subject: Subject, batch: Any) -> dict[str, Any]:
     """Name the lines that wait for the device."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as details:
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
         try:
@@ -244,7 +244,7 @@ def waiting_places(subject: Subject, batch: Any) -> dict[str, Any]:
         finally:
             torch.cuda.set_sync_debug_mode("default")
     places = Counter(
-        "/".join(w.filename.split("/")[-3:]) + f":{w.lineno}" for w in told if "synchroniz" in str(w.message).lower()
+        "/".join(w.filename.split("/")[-3:]) + f":{w.lineno}" for w in details if "synchroniz" in str(w.message).lower()
     )
     return {"count": sum(places.values()), "places": dict(places.most_common(40))}
 
@@ -267,13 +267,13 @@ def latency(name: str, setting: Setting) -> list[Item]:
         if on_gpu:
             torch.cuda.reset_peak_memory_stats()
         seconds = timed(lambda: of.once(batch), setting.device, runs, 0 if setting.quick else 5)
-        told: dict[str, Any] = {"ms": round(1e3 * seconds, 3), "points": len(batch.points)}
+        details: dict[str, Any] = {"ms": round(1e3 * seconds, 3), "points": len(batch.points)}
         if on_gpu:
-            told["peak_mb"] = round(torch.cuda.max_memory_allocated() / 1e6, 1)
+            details["peak_mb"] = round(torch.cuda.max_memory_allocated() / 1e6, 1)
         all_stages = [of.stages(batch) for _ in range(max(1, runs // 3))]
         names = list(all_stages[0])
-        told["stages"] = {n: round(statistics.median(s.get(n, 0.0) for s in all_stages), 3) for n in names}
-        return told
+        details["stages"] = {n: round(statistics.median(s.get(n, 0.0) for s in all_stages), 3) for n in names}
+        return details
 
     def counts(precision: str, size: int) -> dict[str, Any]:
         return work_of(subject(precision), setting.batch(size).to(setting.device))
@@ -294,8 +294,8 @@ def latency(name: str, setting: Setting) -> list[Item]:
 
 def training(name: str, setting: Setting) -> list[Item]:
     """Steps a second on sweeps that lie on the device already: what the data must keep up with."""
-    from beambox.train.feed import TrainingBatch
-    from beambox.train.loop import TrainStep
+    from beambox.train.dataset import TrainingBatch
+    from beambox.train.loop import ModelWithLoss
     from beambox.train.optim import adam
 
     on_gpu = setting.device == "cuda"
@@ -304,7 +304,7 @@ def training(name: str, setting: Setting) -> list[Item]:
         recipe = recipe_of(name)
         model: Any = full_width(name)
         model = model.to(setting.device).to(memory_format=torch.channels_last).train()
-        step, optimizer = TrainStep(model), adam(model.parameters(), recipe.optim)
+        step, optimizer = ModelWithLoss(model), adam(model.parameters(), recipe.optim)
         work = TrainingBatch(setting.batch(size), None)
         spent: dict[str, list[float]] = {"forward and loss": [], "backward": [], "optimizer": []}
         if on_gpu:
@@ -334,13 +334,13 @@ def training(name: str, setting: Setting) -> list[Item]:
                     spent[part].append(took)
         _wait(on_gpu)
         seconds = (time.perf_counter() - begin) / runs
-        told: dict[str, Any] = {"steps_per_s": round(1 / seconds, 3), "sweeps_per_s": round(size / seconds, 2)}
-        told |= {"batch": size, "stages_ms": {part: round(statistics.median(t), 2) for part, t in spent.items()}}
-        told |= {"losses": [round(value, 4) for value in (losses[0], losses[-1])]}
-        told["ok"] = all(math.isfinite(value) for value in losses)
+        details: dict[str, Any] = {"steps_per_s": round(1 / seconds, 3), "sweeps_per_s": round(size / seconds, 2)}
+        details |= {"batch": size, "stages_ms": {part: round(statistics.median(t), 2) for part, t in spent.items()}}
+        details |= {"losses": [round(value, 4) for value in (losses[0], losses[-1])]}
+        details["ok"] = all(math.isfinite(value) for value in losses)
         if on_gpu:
-            told["peak_mb"] = round(torch.cuda.max_memory_allocated() / 1e6, 1)
-        return told
+            details["peak_mb"] = round(torch.cuda.max_memory_allocated() / 1e6, 1)
+        return details
 
     size = 1 if setting.quick else recipe_of(name).optim.batch
     precision = "bfloat16" if on_gpu else "float32"

@@ -22,8 +22,8 @@ def table(report: Report) -> str:
 
 def machine(report: Report) -> list[str]:
     """What it ran on, and what that can do at best."""
-    told = items(report, "environment").get("versions", {})
-    named = ", ".join(f"{k} {v}" for k, v in told.items() if k not in ("took",))
+    details = items(report, "environment").get("versions", {})
+    named = ", ".join(f"{k} {v}" for k, v in details.items() if k not in ("took",))
     best = items(report, "peaks")
     rates = [f"{name} {item['tflops']} TFLOP/s" for name, item in best.items() if "tflops" in item]
     rates += [f"copy {best['copy']['gbps']} GB/s"] if "gbps" in best.get("copy", {}) else []
@@ -37,12 +37,12 @@ def correctness(report: Report) -> list[str]:
     for name, group in report["groups"].items():
         if not name.startswith(("ops:", "same:", "tests")):
             continue
-        told = group.get("items", {})
-        judged = {k: v for k, v in told.items() if "ok" in v or "error" in v}
+        details = group.get("items", {})
+        judged = {k: v for k, v in details.items() if "ok" in v or "error" in v}
         good = sum(v.get("ok") is True for v in judged.values())
-        worst = max((v["worst"] for v in told.values() if "worst" in v), default=None)
+        worst = max((v["worst"] for v in details.values() if "worst" in v), default=None)
         shown = "" if worst is None else f"{worst:.1e}"
-        passed = [f"{v['passed']} tests passed, {len(v['failed'])} failed" for v in told.values() if "passed" in v]
+        passed = [f"{v['passed']} tests passed, {len(v['failed'])} failed" for v in details.values() if "passed" in v]
         lines.append(f"{name:28} {good:7} {len(judged):5}  {shown}{'; '.join(passed)}{group.get('skipped', '')}")
     return lines
 
@@ -59,10 +59,10 @@ def speed(report: Report) -> list[str]:
         f"{'of peak':>8} {'of copy':>8} {'launches':>9} {'waits':>6} {'kernels':>8} {'MB':>7}"
     ]
     for name in DETECTORS:
-        told = items(report, f"speed:{name}")
-        main = "bfloat16" if "bfloat16 batch 1" in told else "float32"
-        one, eight, plain = (told.get(k, {}) for k in (f"{main} batch 1", f"{main} batch 8", "float32 batch 1"))
-        work, launches, waits = (told.get(k, {}) for k in ("work, batch 1", "launches, batch 1", "waits, batch 1"))
+        details = items(report, f"speed:{name}")
+        main = "bfloat16" if "bfloat16 batch 1" in details else "float32"
+        one, eight, plain = (details.get(k, {}) for k in (f"{main} batch 1", f"{main} batch 8", "float32 batch 1"))
+        work, launches, waits = (details.get(k, {}) for k in ("work, batch 1", "launches, batch 1", "waits, batch 1"))
         ms = one.get("ms")
         peak = f"{100 * work['gflop'] / ms / rate:.1f} %" if ms and rate and "gflop" in work else ""
         moved = f"{100 * work['gb'] / ms * 1e3 / copy:.1f} %" if ms and copy and "gb" in work else ""
@@ -75,9 +75,9 @@ def speed(report: Report) -> list[str]:
             f"{launches.get('kernels_ms', ''):>8} {one.get('peak_mb', ''):>7}"
         )
     for name in DETECTORS:
-        told = items(report, f"speed:{name}")
+        details = items(report, f"speed:{name}")
         for key in ("bfloat16 batch 1", "float32 batch 1"):
-            stages = told.get(key, {}).get("stages")
+            stages = details.get(key, {}).get("stages")
             if stages:
                 lines.append(f"{name}, {key}: " + ", ".join(f"{k} {v:.2f}" for k, v in stages.items() if v >= 0.005))
                 break
@@ -88,12 +88,12 @@ def steps(report: Report) -> list[str]:
     """Training."""
     lines = [f"{'training':14} {'steps/s':>8} {'sweeps/s':>9} {'batch':>6} {'peak MB':>9}  ms"]
     for name in DETECTORS:
-        for key, told in items(report, f"speed:{name}").items():
-            if "steps_per_s" in told:
-                parts = ", ".join(f"{k} {v}" for k, v in told["stages_ms"].items())
+        for key, details in items(report, f"speed:{name}").items():
+            if "steps_per_s" in details:
+                parts = ", ".join(f"{k} {v}" for k, v in details["stages_ms"].items())
                 lines.append(
-                    f"{name:14} {told['steps_per_s']:8} {told['sweeps_per_s']:9} {told['batch']:6} "
-                    f"{told.get('peak_mb', ''):>9}  {parts} ({key})"
+                    f"{name:14} {details['steps_per_s']:8} {details['sweeps_per_s']:9} {details['batch']:6} "
+                    f"{details.get('peak_mb', ''):>9}  {parts} ({key})"
                 )
     return lines
 
@@ -102,12 +102,14 @@ def faults(report: Report) -> list[str]:
     """All that failed, and why."""
     lines = []
     for name, group in report["groups"].items():
-        for item, told in group.get("items", {}).items():
-            if "error" in told:
-                lines.append(f"FAILED {name}: {item}: {told['error']}")
-            elif told.get("ok") is False:
+        for item, details in group.get("items", {}).items():
+            if "error" in details:
+                lines.append(f"FAILED {name}: {item}: {details['error']}")
+            elif details.get("ok") is False:
                 shown = {
-                    k: told[k] for k in ("worst", "limit", "wrong", "of", "count", "matched", "failed") if k in told
+                    k: details[k]
+                    for k in ("worst", "limit", "wrong", "of", "count", "matched", "failed")
+                    if k in details
                 }
                 lines.append(f"FAILED {name}: {item}: {shown}")
     return ["", *lines] if lines else ["", "nothing failed"]

@@ -46,7 +46,7 @@ SETTLING = 10
 
 
 @dataclass
-class Clock:
+class Timer:
     """How long this sitting may last, and what it has found out."""
 
     end: float
@@ -83,27 +83,27 @@ class Clock:
 class TimedRun(loop.Run):
     """A run whose length follows the clock."""
 
-    clock: Clock
+    clock: Timer
     """Set on the class: the run is built by ``train``."""
     _marks: tuple[int, float] | None = None
     _saved: float = 0.0
 
-    def advance(self, work: Any, clock: Any) -> Any:
+    def train_step(self, work: Any, clock: Any) -> Any:
         """Make a step; then set the number of steps to what the time left allows."""
         ours = self.clock
         now = time.monotonic()
         if ours.began is None:
             ours.began, ours.losses, self._saved = now, [], now
             self.total = 10**7  # until the pace is known
-        told = super().advance(work, clock)
+        details = super().train_step(work, clock)
         if self._marks is None and self.step - self._first >= SETTLING:
             self._synchronize()
             self._marks = (self.step, time.monotonic())
         if self._marks is not None and (self.step - self._marks[0]) % 20 == 0 and self.step > self._marks[0]:
-            self._replan(float(told[0]["total"]))
+            self._replan(float(details[0]["total"]))
         if self.clock.left() <= 0:
             self.total = self.step
-        return told
+        return details
 
     def _replan(self, loss: float) -> None:
         assert self._marks is not None
@@ -194,7 +194,7 @@ def data_folder(arguments: argparse.Namespace, scratch: Path) -> Path:
 
 
 def simulated(arguments: argparse.Namespace, data: Path, scratch: Path) -> tuple[SourceSection, float]:
-    """Make sweeps with all cores; returns the source and sweeps a second."""
+    """Make sweeps with all cores; returns the source and sweeps per second."""
     from beambox.simulate import write_dataset
 
     start = time.monotonic()
@@ -222,15 +222,15 @@ def adapt(recipe: Recipe, arguments: argparse.Namespace, extra: SourceSection | 
 
 
 def pace_of_data(recipe: Recipe, data: Path, scratch: Path, seconds: float) -> dict[str, float]:
-    """Measure how many sweeps a second one core prepares, augmentation and object sampling included."""
+    """Measure how many sweeps per second one core prepares, augmentation and object sampling included."""
     from beambox.train.devices import make_fabric
 
-    run = loop.assemble(recipe, data, scratch / "pace", make_fabric("float32"), scratch / "pace.npz", False)
-    _ = run.feed[0]
+    run = loop.build_run(recipe, data, scratch / "pace", make_fabric("float32"), scratch / "pace.npz", False)
+    _ = run.dataset[0]
     torch.set_num_threads(1)
     start, step = time.perf_counter(), 1
     while time.perf_counter() - start < seconds:
-        _ = run.feed[step]
+        _ = run.dataset[step]
         step += 1
     rate = (step - 1) * recipe.optim.batch / (time.perf_counter() - start)
     return {"sweeps_per_second_per_core": round(rate, 2)}
@@ -244,9 +244,9 @@ class Tee:
 
     def write(self, text: str) -> int:
         """Write."""
-        for stream in self.streams:
-            stream.write(text)
-            stream.flush()
+        for make_loader in self.streams:
+            make_loader.write(text)
+            make_loader.flush()
         return len(text)
 
     def flush(self) -> None:
@@ -263,14 +263,14 @@ def sitting(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
     out: Path = arguments.out
     recipe = read_recipe(arguments.recipe, arguments.change or [])
     data = data_folder(arguments, scratch)
-    told: dict[str, Any] = {"recipe": recipe.name, "workers": arguments.workers, "batch": recipe.optim.batch}
+    details: dict[str, Any] = {"recipe": recipe.name, "workers": arguments.workers, "batch": recipe.optim.batch}
     extra = None
     if arguments.simulate:
-        extra, told["simulated_per_second"] = simulated(arguments, data, scratch)
+        extra, details["simulated_per_second"] = simulated(arguments, data, scratch)
     recipe = adapt(recipe, arguments, extra)
     if arguments.measure_data:
-        return told | pace_of_data(recipe, data, scratch, arguments.measure_data)
-    told["prepared_s"] = round(time.monotonic() - began, 1)
+        return details | pace_of_data(recipe, data, scratch, arguments.measure_data)
+    details["prepared_s"] = round(time.monotonic() - began, 1)
     before = 0.0
     run_folder = scratch / "run"
     if arguments.resume:
@@ -278,15 +278,15 @@ def sitting(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
         former = arguments.resume / "gpu_train.json"
         before = json.loads(former.read_text())["trained_s"] if former.exists() else 0.0
     whole = None if arguments.whole_minutes is None else 60 * arguments.whole_minutes
-    clock = Clock(arguments.began + 60 * arguments.minutes, whole, before, out, arguments.save_every)
+    clock = Timer(arguments.began + 60 * arguments.minutes, whole, before, out, arguments.save_every)
     TimedRun.clock = clock
     loop.Run = TimedRun
     outcome = loop.train(recipe, data, run_folder, resume=bool(arguments.resume))
-    told |= {"step": outcome.step, "finished": outcome.finished, "trained_s": round(clock.trained(), 1)}
-    told |= {"seconds_per_step": None if clock.pace is None else round(clock.pace, 4), "losses": clock.losses}
+    details |= {"step": outcome.step, "finished": outcome.finished, "trained_s": round(clock.trained(), 1)}
+    details |= {"seconds_per_step": None if clock.pace is None else round(clock.pace, 4), "losses": clock.losses}
     if torch.cuda.is_available():
-        told |= {"gpu": torch.cuda.get_device_name(), "peak_mb": round(torch.cuda.max_memory_allocated() / 1e6, 1)}
-    return told
+        details |= {"gpu": torch.cuda.get_device_name(), "peak_mb": round(torch.cuda.max_memory_allocated() / 1e6, 1)}
+    return details
 
 
 def main() -> None:
@@ -316,10 +316,10 @@ def main() -> None:
         (arguments.out / "train.log").open("a", encoding="utf-8") as log,
         contextlib.redirect_stdout(Tee(sys.stdout, log)),
     ):
-        told = sitting(arguments, Path(scratch))
-        told["seconds"] = round(time.monotonic() - began, 1)
-        (arguments.out / "gpu_train.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
-        print(json.dumps({key: value for key, value in told.items() if key != "losses"}), flush=True)
+        details = sitting(arguments, Path(scratch))
+        details["seconds"] = round(time.monotonic() - began, 1)
+        (arguments.out / "gpu_train.json").write_text(json.dumps(details, indent=1), encoding="utf-8")
+        print(json.dumps({key: value for key, value in details.items() if key != "losses"}), flush=True)
 
 
 if __name__ == "__main__":

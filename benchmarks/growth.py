@@ -3,10 +3,10 @@
     python benchmarks/growth.py [--model pointpillars-kitti] [--threads 2] [--rounds 3] [--out growth.png] [--json FILE]
 
 Points are those of simulated sweeps, all around the sensor, several on top of each other with a little noise where more
-are wanted; 30,000 where something else is varied. Times are the shortest of the rounds, from points in memory to boxes;
-memory is what the process held at most during the first pass, beyond what it held before (not for boxes, for which a pass
-has to run before). Each setting has a process of its own. Boxes are the anchors above the score threshold, which the
-class bias is shifted for; only the best 4,096 enter the suppression.
+are wanted; 30,000 where something else is varied. Times are the shortest of the rounds, from points in memory to boxes.
+Memory is what the process held at most during the first pass, beyond what it held before (not for boxes, for which a
+pass has to run before). Each setting has a process of its own. Boxes are the anchors above the score threshold, which
+the class bias is shifted for; only the best 4,096 enter the suppression.
 """
 
 from __future__ import annotations

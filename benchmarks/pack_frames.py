@@ -34,8 +34,8 @@ def encode(points: np.ndarray) -> bytes:
     Raises:
         SystemExit: if they are not whole millimetres and hundredths: this would lose something.
     """
-    metres = points[:, :3].astype(np.float64)
-    whole = np.round(metres * 1000).astype(np.int32)
+    meters = points[:, :3].astype(np.float64)
+    whole = np.round(meters * 1000).astype(np.int32)
     bright = np.round(points[:, 3].astype(np.float64) * 100).astype(np.int64)
     if not ((whole / 1000).astype(np.float32) == points[:, :3]).all():
         raise SystemExit("a coordinate is not a whole number of millimetres as KITTI's are; packing would change it")

@@ -67,7 +67,9 @@ def random_network(points: torch.Tensor) -> Any:
         model.train()(batch)
         torch.nn.init.normal_(model.head.cls.weight, std=0.1)
         scores = model.eval()(batch).cls.flatten()
-        model.head.cls.bias -= torch.quantile(scores[:: max(1, len(scores) // 1_000_000)], 0.999) + 2.2
+        bias = model.head.cls.bias
+        assert bias is not None
+        bias -= torch.quantile(scores[:: max(1, len(scores) // 1_000_000)], 0.999) + 2.2
     return model
 
 
@@ -175,7 +177,7 @@ def of_torch_pointcloud(name: str, folder: Path) -> Runs:
 
     theirs = PointPillarsDetection(
         anchor_sizes=[anchor.size for anchor in KITTI_ANCHORS],
-        anchor_bottom_heights=[anchor.bottom for anchor in KITTI_ANCHORS],
+        anchor_bottom_heights=[anchor.bottom_z for anchor in KITTI_ANCHORS],
         feature_map_stride=2,
         norm_kwargs={"eps": 1e-3},
     ).eval()

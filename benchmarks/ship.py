@@ -18,8 +18,8 @@ from beambox.detectors.weights import load_weights, save_weights
 def ship(weights: Path, card: Path) -> Path:
     """Write the weights beside their card, under its name."""
     target = card.with_suffix(".safetensors")
-    said = yaml.safe_load(card.read_text(encoding="utf-8"))
-    save_weights(target, load_weights(weights), said, half=True)
+    entries = yaml.safe_load(card.read_text(encoding="utf-8"))
+    save_weights(target, load_weights(weights), entries, half=True)
     return target
 
 

@@ -71,7 +71,7 @@ class Ours:
     def parts(self) -> dict[str, float]:
         """Time the parts of one pass in CPU seconds: maps, products, and products on rows that need no gathering."""
         from beambox.ops.sparse_conv import SparseTensor, kernel_map
-        from beambox.ops.sparse_conv.cpu import multiply
+        from beambox.ops.sparse_conv.cpu import forward
         from beambox.ops.sparse_conv.cpu_maps import block_pairs
 
         voxels = self.voxels
@@ -80,16 +80,16 @@ class Ours:
         macs = 0
         for block in self.blocks():
             start = time.process_time()
-            pairs = kernel_map(x.sites, block.conv.geometry)
+            pairs = kernel_map(x.sites, block.conv.spec)
             blocks = pairs.kept(block_pairs)
             found = time.process_time()
-            features = multiply(x.features, block.conv.weight.detach(), None, pairs)
+            features = forward(x.features, block.conv.weight.detach(), None, pairs)
             done = time.process_time()
             kept = blocks.source.copy()
             in_order = np.arange(kept.size).reshape(kept.shape) % max(1, len(x.sites))
             blocks.source[:] = in_order
             again = time.process_time()
-            multiply(x.features, block.conv.weight.detach(), None, pairs)
+            forward(x.features, block.conv.weight.detach(), None, pairs)
             spent["multiply alone"] += time.process_time() - again
             blocks.source[:] = kept
             spent["index building"] += found - start
@@ -115,12 +115,12 @@ class Spconv:
         self.indices = self.voxels.indices.int()
         layers: list[nn.Module] = []
         for number, block in enumerate(Ours.blocks(self_with(encoder()))):
-            geometry, (_, c_in, c_out) = block.conv.geometry, block.conv.weight.shape
-            if geometry.submanifold:
-                conv = spconv.SubMConv3d(c_in, c_out, geometry.kernel, bias=False, indice_key=f"at{self.level(layers)}")
+            spec, (_, c_in, c_out) = block.conv.spec, block.conv.weight.shape
+            if spec.submanifold:
+                conv = spconv.SubMConv3d(c_in, c_out, spec.kernel, bias=False, indice_key=f"at{self.level(layers)}")
             else:
                 conv = spconv.SparseConv3d(
-                    c_in, c_out, geometry.kernel, geometry.stride, geometry.padding, bias=False, indice_key=f"d{number}"
+                    c_in, c_out, spec.kernel, spec.stride, spec.padding, bias=False, indice_key=f"d{number}"
                 )
             kernel = block.conv.kernel().detach()  # (kz, ky, kx, C_in, C_out)
             conv.weight.data.copy_(kernel.permute(4, 0, 1, 2, 3))

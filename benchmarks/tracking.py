@@ -2,8 +2,8 @@
 
     python benchmarks/tracking.py --results DIR --labels label_02.txt --calib calib.txt
 
-DIR holds the detections of the drive, one file a sweep, as `beambox detect --format json` writes them. The simple
-tracker continues an identity where the boxes of two successive sweeps overlap by more than 0.1 seen from above, best
+DIR holds the detections of the drive, one file per sweep, as `beambox detect --format json` writes them. The simple
+tracker continues an identity where the boxes of two successive sweeps overlap by more than 0.1 in BEV, best
 overlap first; it takes detections from score 0.3 or, tried as well, 0.5 on.
 """
 
@@ -26,12 +26,12 @@ from beambox.track.sequence import Step, read_drive, track_drive
 IMAGE = (1242, 375)
 
 
-def simple(steps: list[Step], calibration: Calibration, min_score: float) -> str:
+def simple(steps: list[Step], calibration: Calibration, score_threshold: float) -> str:
     """Track by overlap with the sweep before, nothing else."""
     text, following = "", 1
     before, known = Detections.empty(), []
     for step in steps:
-        found = step.detections[step.detections.scores >= min_score]
+        found = step.detections[step.detections.scores >= score_threshold]
         ids = [0] * len(found)
         if len(before) and len(found):
             overlap = iou_bev(found.boxes, before.boxes)

@@ -54,8 +54,8 @@ def test_unknown_names_are_attribute_errors() -> None:
 
 
 def test_the_version_is_the_installed_one() -> None:
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-m", "beambox", "--version"], capture_output=True, text=True, check=True,
         env={"PYTHONPATH": str(__import__("pathlib").Path(beambox.__file__).parents[1])},
     ).stdout  # fmt: skip
-    assert said.strip() == f"beambox {beambox.__version__}"
+    assert output.strip() == f"beambox {beambox.__version__}"

@@ -21,11 +21,11 @@ MAY_IMPORT = {
     "data": {"structures", "geometry", "ops"},
     "metrics": {"structures", "geometry", "ops"},
     "simulate": {"structures", "geometry", "ops", "data", "metrics"},
-    "visualise": {"structures", "geometry"},
-    "infer": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "zoo"},
-    "train": {"detectors", "data", "simulate", "metrics", "structures", "visualise", "geometry", "ops", "infer"},
-    "explain": {"infer", "detectors", "layers", "ops", "structures", "visualise", "geometry"},
-    "report": {"infer", "data", "metrics", "visualise", "structures", "geometry", "ops"},
+    "visualize": {"structures", "geometry"},
+    "infer": {"detectors", "data", "simulate", "metrics", "structures", "visualize", "geometry", "ops", "zoo"},
+    "train": {"detectors", "data", "simulate", "metrics", "structures", "visualize", "geometry", "ops", "infer", "zoo"},
+    "explain": {"infer", "detectors", "layers", "ops", "structures", "visualize", "geometry"},
+    "report": {"infer", "data", "metrics", "visualize", "structures", "geometry", "ops", "zoo"},
     "export": {"detectors", "structures", "layers", "ops", "geometry"},
     "stream": {"track", "infer", "data", "structures", "geometry"},
     "track": {"infer", "data", "metrics", "structures", "geometry", "ops"},
@@ -33,7 +33,7 @@ MAY_IMPORT = {
 }
 # file -> folders that it may import besides, but inside its functions only: thin doors from a value to what draws and
 # writes it, see docs/decisions.md.
-MAY_DEFER = {"structures/conversions.py": {"visualise", "data"}}
+MAY_DEFER = {"structures/conversions.py": {"visualize", "data"}}
 GROUND_FLOOR = {"callable_package", "checks", "io", "progress"}
 GEOMETRY_MAY_USE = {"__future__", "math", "dataclasses", "collections", "typing", "torch", "beambox"}
 

@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from beambox.cli.commands import COMMANDS
+from beambox.detectors.catalog import CATALOG
 from beambox.train.recipes import find_recipe, list_recipes
 from beambox.train.tables import TABLES
 from beambox.zoo import shipped
@@ -59,7 +60,9 @@ def test_commands_options_and_names_that_pages_use_exist(page: str, words: tuple
     assert used <= options_of(words[0]), f"{page}: {' '.join(words)}"
     given = dict(itertools.pairwise(words))
     model = given.get("--model") or given.get("-m") or (words[1] if words[0] in ("evaluate", "export", "bench") else "")
-    assert not model or model in shipped() or TO_RUN.search(model), f"{page}: no weights are called {model}"
+    detector = words[0] == "import-openpcdet" or "--config" in words  # not weights
+    known = {*CATALOG, *(one.name for one in list_recipes())} if detector else shipped()
+    assert not model or model in known or TO_RUN.search(model), f"{page}: no weights are called {model}"
     recipe = given.get("--recipe") or (words[1] if words[0] == "train" else "")
     if recipe and not TO_RUN.search(recipe):
         assert find_recipe(recipe).stem == recipe
@@ -86,14 +89,14 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Stand in a folder with the sweeps that the README names; every shipped name gives small weights."""
     weights = tiny_weights(tmp_path)
 
-    class Shelf(dict):
+    class AnyShipped(dict):
         def __contains__(self, name: object) -> bool:
             return True
 
         def __missing__(self, name: str) -> Path:
             return weights
 
-    monkeypatch.setattr("beambox.infer.predictor.shipped", Shelf)
+    monkeypatch.setattr("beambox.zoo.shipped", AnyShipped)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scans").mkdir()
     for name in ("scan.bin", "scans/a.bin", "scans/b.bin"):
@@ -101,7 +104,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/detect.md", "docs/pictures.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/start.md", "docs/detect.md", "docs/pictures.md"])
 def test_python_of_the_documents_runs(desk: Path, capsys: pytest.CaptureFixture[str], page: str) -> None:
     found = [block for block in pages.blocks(ROOT / page) if block.language == "python"]
     assert found

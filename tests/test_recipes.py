@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import build, tensors_since
+from beambox.detectors.catalog import build, tensors_since
 from beambox.detectors.weights import read_weights
 from beambox.train.config import read_recipe
 from beambox.train.recipes import AUDIENCES, find_recipe, list_recipes
@@ -46,13 +46,13 @@ def test_each_shipped_weight_has_a_recipe_of_its_name_and_network(name: str) -> 
     assert RECIPES[name].audience == "shipped"
     stored = read_weights(shipped()[name])
     last = read_stages(name)[-1]
-    made = build(last.detector.name, last.detector.options)
+    built = build(last.detector.name, last.detector.options)
     assert last.detector.name == stored.detector
-    own = made.state_dict()
-    assert {key: tuple(value.shape) for key, value in tensors_since(made, stored.tensors).items()} == {
+    own = built.state_dict()
+    assert {key: tuple(value.shape) for key, value in tensors_since(built, stored.tensors).items()} == {
         key: tuple(value.shape) for key, value in own.items()
     }
-    assert made.config.smooth_l1_beta == stored.config["smooth_l1_beta"]
+    assert built.config.smooth_l1_beta == stored.config["smooth_l1_beta"]
     steps = sum(stage.optim.iterations or 0 for stage in read_stages(name))
     assert f"{steps:,} steps" in stored.card["training"], "the recipe makes as many steps as the card tells of"
 

@@ -11,7 +11,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 def test_the_page_is_up_to_date() -> None:
-    made = runpy.run_path(str(DOCS / "make_reference.py"))["page"]()
+    generated = runpy.run_path(str(DOCS / "make_reference.py"))["page"]()
     there = (DOCS / "reference.md").read_text(encoding="utf-8")
-    assert made == there, "run: python docs/make_reference.py"
-    assert all(f"### {name}\n" in made for name in beambox.__all__)
+    assert generated == there, "run: python docs/make_reference.py"
+    assert all(f"### {name}\n" in generated for name in beambox.__all__)

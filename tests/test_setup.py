@@ -56,10 +56,10 @@ def test_the_index_alone_gives_everything(version: str, tmp_path: Path) -> None:
     if done.returncode and any(word in done.stderr for word in UNREACHABLE):
         pytest.skip("the package index cannot be reached from here")
     assert done.returncode == 0, done.stderr[-2000:]
-    got = {one["metadata"]["name"].lower(): one for one in json.loads(report.read_text())["install"]}
-    assert got["torch"]["metadata"]["version"] == "2.13.0"
-    assert not got["torch"]["download_info"]["url"].startswith("file:"), "a wheel from this machine's disk came in"
-    assert {"numba", "lightning-fabric", "pypcd4", "onnx", "pytest"} <= set(got)
+    actual = {one["metadata"]["name"].lower(): one for one in json.loads(report.read_text())["install"]}
+    assert actual["torch"]["metadata"]["version"] == "2.13.0"
+    assert not actual["torch"]["download_info"]["url"].startswith("file:"), "a wheel from this machine's disk came in"
+    assert {"numba", "lightning-fabric", "pypcd4", "onnx", "pytest"} <= set(actual)
 
 
 def test_every_pin_names_one_version_of_one_package_for_each_python() -> None:

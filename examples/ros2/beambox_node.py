@@ -19,7 +19,7 @@ from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithP
 
 import beambox
 from beambox.data.formats.point_cloud2 import cloud_columns
-from beambox.data.reading import frame_from_columns
+from beambox.data.read_points import frame_from_columns
 from beambox.track import Tracker
 
 
@@ -29,7 +29,7 @@ class BeamboxNode(Node):
     def __init__(self) -> None:
         super().__init__("beambox")
         model = self.declare_parameter("model", "pointpillars-sim").value
-        self.min_score = float(self.declare_parameter("min_score", 0.3).value)
+        self.score_threshold = float(self.declare_parameter("score_threshold", 0.3).value)
         self.detector = beambox.load(model)
         self.tracker = Tracker()
         self.last = 0.0
@@ -45,7 +45,7 @@ class BeamboxNode(Node):
         if time < self.last:
             self.tracker.reset()
         self.last = time
-        tracks = self.tracker.update(found[found.scores >= self.min_score], time)
+        tracks = self.tracker.update(found[found.scores >= self.score_threshold], time)
         self.publisher.publish(self.message(cloud, tracks))
 
     def message(self, cloud: PointCloud2, tracks) -> Detection3DArray:

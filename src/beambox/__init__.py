@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from beambox.checks import BeamboxError as BeamboxError
     from beambox.data.kitti import KittiSource as KittiSource
-    from beambox.data.reading import read_frame as read_frame
+    from beambox.data.read_points import read_frame as read_frame
     from beambox.geometry.calibration import Calibration as Calibration
     from beambox.geometry.grid import VoxelGrid as VoxelGrid
     from beambox.infer.predictor import Detector as Detector
@@ -55,7 +55,7 @@ _PUBLIC = {
     "export": "",
     "load": "beambox.infer.predictor",
     "open_dataset": "beambox.verbs",
-    "read_frame": "beambox.data.reading",
+    "read_frame": "beambox.data.read_points",
     "recipes": "beambox.verbs",
     "simulate": "",
     "train": "",

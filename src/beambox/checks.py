@@ -7,6 +7,7 @@ Plain ``assert`` is kept for our own invariants.
 from __future__ import annotations
 
 import difflib
+import importlib.util
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from enum import Enum
@@ -24,6 +25,7 @@ __all__ = [
     "did_you_mean",
     "expect_dtype",
     "expect_finite",
+    "expect_library",
     "expect_one_of",
     "expect_same_length",
     "expect_shape",
@@ -91,8 +93,8 @@ def expect_finite(name: str, tensor: Tensor) -> None:
 def expect_same_length(**lengths: int) -> None:
     """Check that several sequences, given as ``name=len(sequence)``, have one length."""
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"`{name}` has {n}" for name, n in lengths.items())
-        raise BeamboxError(f"these must have the same length: {told}")
+        details = ", ".join(f"`{name}` has {n}" for name, n in lengths.items())
+        raise BeamboxError(f"these must have the same length: {details}")
 
 
 E = TypeVar("E", bound=Enum)
@@ -176,6 +178,18 @@ def _shortened(text: str, limit: int) -> str:
         return text
     half = max(1, limit // 2 - 20)
     return f"{text[:half]} ... ({len(text):,} characters) ... {text[-half:]}"
+
+
+def expect_library(name: str, extra: str, what: str) -> None:
+    """Refuse to begin what needs an optional library that is absent.
+
+    Args:
+        name: of its module.
+        extra: of beambox, which installs it.
+        what: needs it, for the message.
+    """
+    if importlib.util.find_spec(name) is None:
+        raise BeamboxError(f"{what} needs the library {name}, which is not installed: {how_to_install(extra)}")
 
 
 def how_to_install(extra: str) -> str:

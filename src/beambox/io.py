@@ -186,8 +186,8 @@ def parse_yaml(text: str, where: str) -> Any:
     except yaml.YAMLError as error:
         raise BeamboxError(f"{where} is not valid YAML: {' '.join(str(error).split())[:300]}") from None
     except Exception as error:  # PyYAML's constructors raise whatever int, date and base64 raise
-        told = " ".join(str(error).split())[:120]
-        raise BeamboxError(f"{where} is not valid YAML: {type(error).__name__}: {told}") from None
+        details = " ".join(str(error).split())[:120]
+        raise BeamboxError(f"{where} is not valid YAML: {type(error).__name__}: {details}") from None
     return values
 
 
@@ -283,7 +283,7 @@ def word_to_name(word: str) -> str:
 
 
 def read_names(path: Path, remedy: str = "") -> list[str]:
-    """Read a list of names, one a line (or several, parted by blanks), each a plain file name and there once.
+    """Read a list of names, one per line (or several, parted by blanks), each a plain file name and there once.
 
     Raises:
         MissingFileError: if the list is not there.
@@ -291,7 +291,7 @@ def read_names(path: Path, remedy: str = "") -> list[str]:
     """
     names = read_text(path, remedy).split()
     if not names:
-        raise BeamboxError(f"{path} must hold names, one a line, but is empty")
+        raise BeamboxError(f"{path} must hold names, one per line, but is empty")
     seen: set[str] = set()
     for name in names:
         check_file_name(name, str(path))
@@ -341,8 +341,8 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if isinstance(error, BeamboxError):
             raise
         room = "; free some space or give another folder" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        told = f"cannot write {path}: {error.strerror or error}{room}; nothing half-written is left"
-        raise BeamboxError(told) from error
+        details = f"cannot write {path}: {error.strerror or error}{room}; nothing half-written is left"
+        raise BeamboxError(details) from error
 
 
 def write_bytes(path: Path, content: bytes, *, sync: bool = False) -> None:
@@ -379,7 +379,7 @@ def _host() -> str:
 
 
 def _remove_abandoned(folder: Path, *, again: bool) -> None:
-    """Remove drafts of writers that were killed; folders of very many files are looked through once a process."""
+    """Remove drafts of writers that were killed; folders of very many files are looked through once per process."""
     key = os.path.abspath(folder)
     if key in _swept and not again:
         return

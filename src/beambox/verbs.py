@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from beambox.simulate import Sensor
     from beambox.structures import Detections, Frame, Labels
     from beambox.train.config import Recipe
-    from beambox.train.loop import Outcome
+    from beambox.train.loop import TrainResult
     from beambox.train.recipes import ShippedRecipe
-    from beambox.visualise.bev import ColourBy, Region
+    from beambox.visualize.bev import ColorBy, Region
 
 __all__ = ["draw", "evaluate", "export", "open_dataset", "recipes", "simulate", "train"]
 
@@ -43,9 +43,9 @@ def open_dataset(path: str | Path, split: str = "val", *, camera_view: bool = Fa
     Raises:
         BeamboxError: if nothing is there, or it is no data set.
     """
-    from beambox.data.opening import open_data
+    from beambox.data import open_dataset as data
 
-    return open_data(path, split, fov=camera_view)
+    return data.open_dataset(path, split, fov=camera_view)
 
 
 def evaluate(  # noqa: PLR0913  # each is an option of the command too
@@ -136,7 +136,7 @@ def _found(
     """Detect, or take what was kept."""
     from beambox.infer.evaluate import detect_frames
     from beambox.infer.kept import KeptDetections, digest
-    from beambox.infer.predictor import find_weights
+    from beambox.zoo import find_weights
 
     if keep is None:
         return detect_frames(detector.detect, source, batch=batch, score_threshold=least)
@@ -149,7 +149,7 @@ def _found(
         "precision": str(detector.dtype).removeprefix("torch."),
         "range": [list(detector.grid.minimum), list(detector.grid.maximum)],
         "view": detector.view,
-        "raised": detector.corrections.raise_by,
+        "raised": detector.alignment.z_offset,
         "score_threshold": least,
     }
     kept = KeptDetections(Path(keep), made_by, detector.classes)
@@ -175,7 +175,7 @@ def train(
     *,
     overrides: Sequence[str] = (),
     resume: bool = False,
-) -> Outcome:
+) -> TrainResult:
     """Train a detector by a recipe.
 
     Args:
@@ -192,7 +192,7 @@ def train(
     Raises:
         BeamboxError: if the recipe, the data or the folder cannot be used.
     """
-    from beambox.checks import MissingFileError
+    from beambox.data.existence import expect_data
     from beambox.train.config import Recipe
     from beambox.train.stages import read_stages, train_stages
 
@@ -200,9 +200,7 @@ def train(
         raise BeamboxError("`overrides` change a recipe that is read from a file; change this one itself")
     stages = [recipe] if isinstance(recipe, Recipe) else read_stages(recipe, overrides)
     folder = None if data is None else Path(data)
-    if folder is not None and not folder.exists():
-        kind = "file" if folder.suffix in (".yaml", ".yml") else "folder"
-        raise MissingFileError(f"--data: there is no {kind} {folder}")
+    expect_data(folder)
     return train_stages(stages, folder, Path(out) if out is not None else Path("runs") / stages[-1].name, resume)
 
 
@@ -259,11 +257,11 @@ def draw(
     *,
     out: str | Path | None = None,
     region: Region | None = None,
-    looked_at: Region | None = None,
-    color_by: ColourBy = "height",
+    detection_range: Region | None = None,
+    color_by: ColorBy = "height",
     title: str = "",
 ) -> Image:
-    """Draw a sweep from above, with boxes, and the boxes into its camera image where there is one; needs no display.
+    """Draw a sweep in BEV, with boxes, and the boxes into its camera image where there is one; needs no display.
 
     Args:
         sweep: a path, an array of points, or a frame.
@@ -271,7 +269,7 @@ def draw(
         labels: drawn in green; the frame's own where None.
         out: file to write too: .png, .jpg, or .html for a page in three dimensions.
         region: what to show, metres; chosen from the points where None.
-        looked_at: the detector's region, drawn as a dashed line.
+        detection_range: the detector's region, drawn as a dashed line.
         color_by: what the colors of the points say: "height" or "intensity".
         title: first line of the legend; the frame's name where empty.
 
@@ -284,9 +282,9 @@ def draw(
     from beambox.infer.inputs import read_sweep
     from beambox.io import write_text
     from beambox.structures import Frame
-    from beambox.visualise.canvas import save_picture
-    from beambox.visualise.picture import draw_sweep
-    from beambox.visualise.viewer import viewer_html
+    from beambox.visualize.canvas import save_picture
+    from beambox.visualize.picture import draw_sweep
+    from beambox.visualize.viewer import viewer_html
 
     if isinstance(sweep, str | Path):
         frame = read_sweep(Path(sweep), labels=labels is None)
@@ -294,7 +292,7 @@ def draw(
         frame = sweep if isinstance(sweep, Frame) else Frame.from_array(sweep)
     shown = frame.labels if labels is None else labels
     picture = draw_sweep(
-        frame, detections, shown, region=region, looked_at=looked_at, colour_by=color_by, title=title
+        frame, detections, shown, region=region, detection_range=detection_range, color_by=color_by, title=title
     )  # fmt: skip
     if out is not None and Path(out).suffix.lower() == ".html":
         write_text(Path(out), viewer_html(frame, detections, shown, title=title))
@@ -328,7 +326,8 @@ def export(
     """
     from beambox.detectors.weights import load_weights, read_weights
     from beambox.export.onnx_file import export_onnx, exportable
-    from beambox.infer.predictor import Detector, find_weights, region
+    from beambox.infer.predictor import Detector, region
+    from beambox.zoo import find_weights
 
     path = find_weights(model)
     network = exportable(load_weights(path))

@@ -43,7 +43,7 @@ def test_one_sweep_becomes_one_file(capsys: Capture, weights: Path, scan: Path, 
 
 
 def test_the_command_gives_what_the_library_gives(capsys: Capture, weights: Path, scan: Path, tmp_path: Path) -> None:
-    options = ("--range", "20", "--sensor-height", "1.9", "--axes", "x: right, y: forward", "--min-score", "0.2")
+    options = ("--range", "20", "--sensor-height", "1.9", "--axes", "x: right, y: forward", "--score-threshold", "0.2")
     assert beambox(capsys, "detect", scan, "-m", weights, "-o", tmp_path, *options).status == 0
     found = package.load(weights, range=20, sensor_height=1.9, axes="x: right, y: forward")(scan)
     found = found[found.scores >= 0.2]
@@ -119,7 +119,7 @@ def test_kitti_format_without_calibration_says_so_before_the_work(
 
 
 def test_unknown_weights_are_refused(capsys: Capture, scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("beambox.infer.predictor.shipped", lambda: {"pointpillars-sim": Path("x")})
+    monkeypatch.setattr("beambox.zoo.shipped", lambda: {"pointpillars-sim": Path("x")})
     line = one_line(capsys, "detect", scan, "-m", "pointpillar-sim")
     assert line.endswith('(did you mean "pointpillars-sim"?)')
 

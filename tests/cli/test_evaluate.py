@@ -8,13 +8,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.detectors.weights import save_weights
 from beambox.infer import evaluate as evaluate_module
 from oracles.command_line import beambox
 from oracles.tiny_training import OPTIONS, tiny_kitti
 
-FORKLIFT = {"name": "Forklift", "size": [3.9, 1.6, 1.5], "bottom": -1.73, "matched": 0.5, "unmatched": 0.35}
+FORKLIFT = {
+    "name": "Forklift",
+    "size": [3.9, 1.6, 1.5],
+    "bottom_z": -1.73,
+    "matched_threshold": 0.5,
+    "unmatched_threshold": 0.35,
+}
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +174,7 @@ def test_a_list_that_names_a_frame_twice_is_refused(
     labels = str(kitti / "training" / "label_2")
     (tmp_path / "results").mkdir()
     command = ("score", "kitti", "--labels", labels, "--results", str(tmp_path / "results"), "--allow-missing")
-    ran = beambox(capsys, *command, "--frames", str(tmp_path / "list.txt"))
+    ran = beambox(capsys, *command, "--frame-list", str(tmp_path / "list.txt"))
     assert ran.status == 2
     assert "must name each frame once, but names 000000 again" in ran.err
 

@@ -15,9 +15,9 @@ import pytest
 
 from beambox import Detections, Frame, Labels
 from beambox.checks import did_you_mean, printable
-from beambox.cli.console import LONGEST_LINE, plain, plain_output, say
+from beambox.cli.console import LONGEST_LINE, log, plain, plain_output
 from beambox.cli.main import guard
-from beambox.visualise.viewer import viewer_html
+from beambox.visualize.viewer import viewer_html
 from oracles.command_line import beambox
 from oracles.tiny_detector import street, tiny_weights
 
@@ -38,7 +38,7 @@ def test_long_texts_are_cut_in_the_middle_and_say_how_long_they_are() -> None:
 
 
 def test_messages_and_results_obey_no_escape(capsys: pytest.CaptureFixture[str]) -> None:
-    say(HOSTILE)
+    log(HOSTILE)
     with plain_output():
         print(HOSTILE)
         sys.stdout.writelines([HOSTILE])
@@ -131,17 +131,17 @@ def test_doctor_answers_on_a_console_of_windows(tmp_path: Path) -> None:
 
 def test_doctor_gives_a_detector_its_own_corrections_back(tmp_path: Path) -> None:
     from beambox.cli.doctor import try_out
-    from beambox.infer.corrections import Corrections
     from beambox.infer.doctor import Diagnosis, Finding
     from beambox.infer.predictor import load
+    from beambox.infer.sensor_alignment import SensorAlignment
 
     street().tofile(tmp_path / "scan.bin")
     detector = load(tiny_weights(tmp_path), device="cpu", sensor_height=2.5, intensity_scale=0.5)
-    before = detector.corrections
-    assert before != Corrections()
+    before = detector.alignment
+    assert before != SensorAlignment()
     finding = Finding("height", "bad", "", ("--sensor-height", "1"))
-    try_out(tmp_path / "scan.bin", detector, Diagnosis((finding,), Corrections(raise_by=1.0), 0.1))
-    assert detector.corrections == before and detector.intensity_scale == 0.5
+    try_out(tmp_path / "scan.bin", detector, Diagnosis((finding,), SensorAlignment(z_offset=1.0), 0.1))
+    assert detector.alignment == before and detector.intensity_scale == 0.5
 
 
 def test_hostile_class_names_of_results_reach_no_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,13 +28,13 @@ def marked(kind: str) -> list[str]:
 
 def run_block(block: str, capsys: pytest.CaptureFixture[str]) -> str:
     """Run a block's lines in the current folder: beambox commands, printf into a file, sed of a file."""
-    told = ""
+    output = ""
     for line in block.splitlines():
         words = line.split()
         if words[0] == "beambox":
             ran = beambox(capsys, *words[1:])
             assert ran.status == 0, ran.err
-            told += ran.out
+            output += ran.out
         elif words[0] == "sed":
             edit = re.fullmatch(r'sed -i "s/(.*)/(.*)/" (\S+)', line)
             assert edit is not None
@@ -45,7 +45,7 @@ def run_block(block: str, capsys: pytest.CaptureFixture[str]) -> str:
         else:
             assert words[:2] == ["printf", r"'%s\n'"] and words[-2] == ">"
             Path(words[-1]).write_text("".join(f"{word}\n" for word in words[2:-2]), encoding="utf-8")
-    return told
+    return output
 
 
 def test_the_page_runs_as_printed(
@@ -58,13 +58,13 @@ def test_the_page_runs_as_printed(
     monkeypatch.chdir(tmp_path)
     (name,) = re.findall(r"<!-- file: (\S+) -->", PAGE)
     Path(name).write_text(marked("file: data.yaml")[0], encoding="utf-8")
-    told = "".join(run_block(block, capsys) for block in marked("run"))
+    output = "".join(run_block(block, capsys) for block in marked("run"))
     printed = re.search(r"```\n(7 frames.*?)```", PAGE, flags=re.DOTALL)
-    assert printed is not None and printed[1] in told
-    assert re.search(r"\{name: Car, size: \[4\.\d\d, 1\.\d\d, 1\.\d\d\], bottom: -[12]\.\d\d", told)
+    assert printed is not None and printed[1] in output
+    assert re.search(r"\{name: Car, size: \[4\.\d\d, 1\.\d\d, 1\.\d\d\], bottom_z: -[12]\.\d\d", output)
     weights = tiny_weights(tmp_path)
-    told = run_block(f"beambox evaluate {weights} --data data.yaml --split val --json ap.json", capsys)
-    assert "2 frames" in told and "every object counts" in told
+    output = run_block(f"beambox evaluate {weights} --data data.yaml --split val --json ap.json", capsys)
+    assert "2 frames" in output and "every object counts" in output
     scores = json.loads(Path("ap.json").read_text(encoding="utf-8"))
     assert list(scores["Car"]) == ["iou", "3d", "bev", "precision", "errors"] and len(scores["Car"]["3d"]["all"]) == 1
 

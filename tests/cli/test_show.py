@@ -65,7 +65,7 @@ def test_show_draws_labels_and_camera_beside_and_can_leave_labels_out(capsys: Ca
 
 def test_show_makes_a_folder_of_pictures_for_several(capsys: Capture, tmp_path: Path) -> None:
     kitti_folder(tmp_path / "kitti")
-    ran = beambox(capsys, "show", tmp_path / "kitti", "-o", tmp_path / "pictures", "--colour", "intensity")
+    ran = beambox(capsys, "show", tmp_path / "kitti", "-o", tmp_path / "pictures", "--color", "intensity")
     assert ran.status == 0
     assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == ["000000.png", "000001.png"]
 
@@ -83,7 +83,7 @@ def test_show_turns_other_axes_forward_up(capsys: Capture, weights: Path, scan: 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--colour", "hight"), 'unknown colour "hight" (did you mean "height"?)'),
+        (("--color", "hight"), 'unknown colour "hight" (did you mean "height"?)'),
         (("--results", "nowhere"), "nowhere is not a folder of results"),
         (("--out", "a.tif"), "a picture is written as .png, .jpg or .html, a film as .gif, .webp, .mp4"),
         (("--out", "a.gif", "--rate", "0"), "--rate must be more than 0"),
@@ -174,9 +174,9 @@ def test_show_puts_several_sweeps_into_one_page_and_one_film(capsys: Capture, we
     film = beambox(capsys, "show", velodyne, "--out", tmp_path / "a.webp", "--rate", "4", "--area", "20")
     assert film.status == 0, film.err
     assert Image.open(tmp_path / "a.webp").n_frames == 2  # type: ignore[attr-defined]
-    one = beambox(capsys, "show", velodyne, "--frame", "000001", "--out", tmp_path / "one.png")
+    one = beambox(capsys, "show", velodyne, "--names", "000001", "--out", tmp_path / "one.png")
     assert one.status == 0 and one.out.startswith("000001 ->")
-    none = beambox(capsys, "show", velodyne, "--frame", "000009", "--out", tmp_path / "none.png")
+    none = beambox(capsys, "show", velodyne, "--names", "000009", "--out", tmp_path / "none.png")
     assert none.status == 2 and 'no sweep is called "000009"' in none.err
 
 
@@ -185,15 +185,15 @@ def test_show_draws_a_data_set_of_ones_own_with_its_labels(capsys: Capture, weig
     ran = beambox(capsys, "show", described, "--frames", "2", "--out", tmp_path / "pictures", "--area", "45")
     assert ran.status == 0, ran.err
     assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == ["00.png", "01.png"]
-    options = ("--frame", "00", "--labels", "none", "--area", "45", "--out", tmp_path / "b.png")
+    options = ("--names", "00", "--labels", "none", "--area", "45", "--out", tmp_path / "b.png")
     bare = beambox(capsys, "show", described, *options)
     assert bare.status == 0, bare.err
     with_labels, without = (np.asarray(Image.open(p)) for p in (tmp_path / "pictures" / "00.png", tmp_path / "b.png"))
     green = [(np.abs(each.astype(int) - (94, 234, 140)).sum(axis=-1) < 60).sum() for each in (with_labels, without)]
     assert green[0] > green[1] + 300, "eight cars are outlined"
-    page = beambox(capsys, "show", described, "-m", weights, "--frame", "01", "--out", tmp_path / "p.html")
+    page = beambox(capsys, "show", described, "-m", weights, "--names", "01", "--out", tmp_path / "p.html")
     assert page.status == 0 and (tmp_path / "p.html").read_text(encoding="utf-8").count('"truth":true') == 8, page.err
-    wrong = beambox(capsys, "show", described, "--frame", "77", "--out", tmp_path / "c.png")
+    wrong = beambox(capsys, "show", described, "--names", "77", "--out", tmp_path / "c.png")
     assert wrong.status == 2 and 'the data set has no frame "77"' in wrong.err
     both = beambox(capsys, "show", described, tmp_path / "own" / "velodyne", "--out", tmp_path / "c.png")
     assert both.status == 2 and "a data set is shown by itself" in both.err

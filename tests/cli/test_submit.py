@@ -11,8 +11,8 @@ def test_a_folder_that_lacks_frames_is_refused_in_one_line(tmp_path: Path, capsy
     with pytest.raises(SystemExit) as left:
         main(["submit", str(tmp_path / "results"), "--out", str(tmp_path / "s.zip")])
     assert left.value.code == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "cannot be submitted" in said and "000001" in said
+    output = capsys.readouterr().err
+    assert output.count("\n") == 1 and "cannot be submitted" in output and "000001" in output
     assert not (tmp_path / "s.zip").exists()
 
 

@@ -25,9 +25,9 @@ from beambox.data.augment import (
     shuffle_points,
     translate,
 )
+from beambox.data.bev_overlap import bev_overlap
 from beambox.data.database import ObjectDatabase
-from beambox.data.footprints import overlap_bev
-from beambox.data.road import fit_road_plane
+from beambox.data.ground_plane import fit_ground_plane
 from beambox.data.source import FrameList
 from beambox.geometry import corners_bev
 from beambox.ops.points_in_boxes import points_in_boxes_mask
@@ -64,14 +64,14 @@ GROWN = torch.tensor([1, 1, 1, 1.001, 1.001, 1.001, 1])  # rounding to float32 m
 def same(a: Frame, b: Frame, atol: float = 1e-5) -> None:
     torch.testing.assert_close(a.points, b.points, atol=atol, rtol=1e-5)
     torch.testing.assert_close(labels_of(a).boxes[:, :6], labels_of(b).boxes[:, :6], atol=atol, rtol=1e-5)
-    turn = labels_of(a).boxes[:, 6] - labels_of(b).boxes[:, 6]
-    torch.testing.assert_close(torch.cos(turn), torch.ones_like(turn), atol=1e-5, rtol=0)
+    draw_index = labels_of(a).boxes[:, 6] - labels_of(b).boxes[:, 6]
+    torch.testing.assert_close(torch.cos(draw_index), torch.ones_like(draw_index), atol=1e-5, rtol=0)
 
 
 @given(st.lists(BOX, min_size=1, max_size=4), st.lists(BOX, min_size=1, max_size=4))
 def test_overlap_agrees_with_polygons(first: list, second: list) -> None:
     a, b = np.array(first), np.array(second)
-    found = overlap_bev(a[:, None], b)
+    found = bev_overlap(a[:, None], b)
     assert found.shape == (len(a), len(b))
     outlines = [[Polygon(quad) for quad in corners_bev(torch.from_numpy(boxes)).numpy()] for boxes in (a, b)]
     for i, p in enumerate(outlines[0]):
@@ -120,7 +120,7 @@ def test_moved_objects_do_not_collide_and_the_road_stays(seed: int) -> None:
     frame = scene(seed, objects=10)
     moved = move_objects(frame, np.random.default_rng(seed), math.pi / 2, (1.5, 1.5, 0))
     boxes = labels_of(moved).boxes.numpy()
-    pairs = overlap_bev(boxes[:, None], boxes)
+    pairs = bev_overlap(boxes[:, None], boxes)
     np.fill_diagonal(pairs, False)
     assert not pairs.any()
     shift = labels_of(moved).boxes[:, :3] - labels_of(frame).boxes[:, :3]
@@ -140,9 +140,9 @@ def test_an_object_hemmed_in_stays_where_it_is() -> None:
 def test_sampled_objects_stand_free_on_the_road_with_their_points() -> None:
     base = database()
     assert len(base) == 48
-    for turn in range(6):
-        frame = scene(turn)
-        mixed = sample_objects(frame, AugmentConfig(sample={"Car": 12}), base, turn, seed=1)
+    for draw_index in range(6):
+        frame = scene(draw_index)
+        mixed = sample_objects(frame, AugmentConfig(sample={"Car": 12}), base, draw_index, seed=1)
         labels = labels_of(mixed)
         assert len(labels) > 4 and torch.equal(labels.boxes[:4], labels_of(frame).boxes)
         outlines = [Polygon(quad) for quad in corners_bev(labels.boxes.double()).numpy()]
@@ -175,7 +175,7 @@ def test_whole_scene_counts_what_is_there() -> None:
     assert len(labels_of(sample_objects(frame, AugmentConfig(sample={"Car": 6}), base, 0, 0))) > 6
 
 
-def test_sampled_objects_keep_clear_of_every_labelled_class() -> None:
+def test_sampled_objects_keep_clear_of_every_labeled_class() -> None:
     base = database(1)
     blocked = Frame(torch.zeros(1, 4), "", Labels(torch.from_numpy(base.boxes), ("Van",) * 4))
     assert sample_objects(blocked, AugmentConfig(sample={"Car": 4}), base, 0, 0) is blocked
@@ -184,7 +184,7 @@ def test_sampled_objects_keep_clear_of_every_labelled_class() -> None:
 def test_augmentation_is_a_function_of_its_arguments() -> None:
     frame, base = scene(3), database()
     config = AugmentConfig(sample={"Car": 5}, object_rotation=0.5, object_translation=(0.5, 0.5, 0.1), flip_y=0.5)
-    runs = [augment(frame, np.random.default_rng((4, k)), config, base, turn=2, seed=9) for k in (0, 0, 1)]
+    runs = [augment(frame, np.random.default_rng((4, k)), config, base, draw_index=2, seed=9) for k in (0, 0, 1)]
     assert torch.equal(runs[0].points, runs[1].points)
     assert torch.equal(labels_of(runs[0]).boxes, labels_of(runs[1]).boxes)
     assert not torch.equal(labels_of(runs[0]).boxes, labels_of(runs[2]).boxes)
@@ -229,7 +229,7 @@ def test_the_road_is_found_under_cars_and_strays(slope_x: float, slope_y: float,
     z[tall] += rng.uniform(0.5, 6, tall.sum())
     z[:20] -= rng.uniform(1, 4, 20)  # reflections below the road
     points = torch.from_numpy(np.concatenate((xy, z[:, None]), axis=1).astype(np.float32))
-    plane = fit_road_plane(points)
+    plane = fit_ground_plane(points)
     assert plane is not None
     a, b, c, d = plane.tolist()
     assert math.isclose(a * a + b * b + c * c, 1, abs_tol=1e-5) and c > 0
@@ -238,5 +238,5 @@ def test_the_road_is_found_under_cars_and_strays(slope_x: float, slope_y: float,
 
 
 def test_too_few_points_make_no_road() -> None:
-    assert fit_road_plane(torch.zeros(0, 4)) is None
-    assert fit_road_plane(torch.rand(5, 4)) is None
+    assert fit_ground_plane(torch.zeros(0, 4)) is None
+    assert fit_ground_plane(torch.rand(5, 4)) is None

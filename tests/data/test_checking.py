@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 from beambox.cli.data import app, spread
 from beambox.data.anchor_sizes import proposals_text, propose_anchors
-from beambox.data.check_text import warnings
 from beambox.data.checking import check_frames
 from beambox.data.custom import CustomSource
+from beambox.data.format_report import warnings
 from beambox.structures import Labels
 from oracles.own_data import write_pandaset
 
@@ -66,15 +66,15 @@ def far(boxes: np.ndarray) -> np.ndarray:
     ],
 )
 def test_check_accuses(tmp_path: Path, change: Callable, wanted: list[str]) -> None:
-    told = found(write_pandaset(tmp_path, 3, "sensor_height: 2\nrange: 50\n", change))
-    assert len(told) == len(wanted)
-    for line, piece in zip(told, wanted):
+    lines = found(write_pandaset(tmp_path, 3, "sensor_height: 2\nrange: 50\n", change))
+    assert len(lines) == len(wanted)
+    for line, piece in zip(lines, wanted):
         assert line.startswith("Car: ") and piece in line
 
 
 def test_check_measures_the_ground(tmp_path: Path) -> None:
-    told = found(write_pandaset(tmp_path, 2, "sensor_height: 0.5\n"))
-    assert told == ["the ground lies 1.50 m below where sensor_height puts it; raise sensor_height by 1.50"]
+    lines = found(write_pandaset(tmp_path, 2, "sensor_height: 0.5\n"))
+    assert lines == ["the ground lies 1.50 m below where sensor_height puts it; raise sensor_height by 1.50"]
 
 
 def test_check_measures_a_ground_that_leans(tmp_path: Path) -> None:
@@ -83,15 +83,15 @@ def test_check_measures_a_ground_that_leans(tmp_path: Path) -> None:
         points = np.fromfile(sweep, "<f4").reshape(-1, 4)
         points[:, 2] += 0.01 * points[:, 0] - 0.04 * points[:, 1]
         points.tofile(sweep)
-    (told,) = found(path)
-    got = re.fullmatch(
+    (lines,) = found(path)
+    actual = re.fullmatch(
         r"the ground rises by (\d\.\d)% to the right, 1\.\d m at 40 m; "
         r"add \{forward: (0\.0\d+), left: (-0\.0\d+)\} to ground_slope",
-        told,
+        lines,
     )
-    assert got is not None
-    assert float(got[2]) == pytest.approx(0.01, abs=0.003)
-    assert float(got[3]) == pytest.approx(-0.04, abs=0.003)
+    assert actual is not None
+    assert float(actual[2]) == pytest.approx(0.01, abs=0.003)
+    assert float(actual[3]) == pytest.approx(-0.04, abs=0.003)
     path.write_text(path.read_text() + "ground_slope: {forward: 0.01, left: -0.04}\n")
     assert found(path) == []
     frame = CustomSource(path)[0]
@@ -112,9 +112,9 @@ def test_check_lists_frames(tmp_path: Path) -> None:
     (tmp_path / "boxes" / "01.txt").unlink()
     (tmp_path / "boxes" / "02.txt").write_text("", encoding="utf-8")
     (tmp_path / "velodyne" / "03.bin").write_bytes(b"12345")
-    told = found(path)
-    assert told[0].startswith("cannot be read: ") and "03.bin must hold whole points" in told[0]
-    assert told[1:4] == [
+    lines = found(path)
+    assert lines[0].startswith("cannot be read: ") and "03.bin must hold whole points" in lines[0]
+    assert lines[1:4] == [
         "1 of 5 frames have no point: 00",
         "1 of 5 frames have no label file: 01",
         "1 of 5 frames are labelled and have no box: 02",
@@ -125,8 +125,8 @@ def test_anchors_are_mean_sizes_on_the_ground(tmp_path: Path) -> None:
     source = CustomSource(write_pandaset(tmp_path))
     proposals = propose_anchors(labels for labels in (source.labels(i) for i in range(3)) if labels is not None)
     assert [(one.name, one.boxes, one.size) for one in proposals] == [("Car", 24, (4.4, 1.8, 1.5))]
-    assert proposals[0].bottom == pytest.approx(-1.73, abs=0.01)
-    assert (proposals[0].matched, proposals[0].unmatched, proposals[0].covered) == (0.6, 0.45, 1.0)
+    assert proposals[0].bottom_z == pytest.approx(-1.73, abs=0.01)
+    assert (proposals[0].matched_threshold, proposals[0].unmatched_threshold, proposals[0].covered) == (0.6, 0.45, 1.0)
 
 
 def test_anchors_that_fit_badly_or_rest_on_little_say_so() -> None:
@@ -134,7 +134,7 @@ def test_anchors_that_fit_badly_or_rest_on_little_say_so() -> None:
     boxes[:40, 3:6] = torch.tensor([[4.0, 2, 1.5], [12, 2.5, 3]]).repeat(20, 1)
     boxes[40:, 3:6] = torch.tensor([0.8, 0.6, 1.7])
     text = proposals_text(propose_anchors([Labels(boxes, ("Vehicle",) * 40 + ("Pedestrian",) * 4)]))
-    assert "{name: Vehicle, size: [8.00, 2.25, 2.25], bottom: -1.12, matched: 0.60, unmatched: 0.45}" in text
+    assert "{name: Vehicle, size: [8.00, 2.25, 2.25], bottom_z: -1.12, matched_threshold: 0.60, " in text
     assert "# Vehicle: sizes vary much" in text and "# Pedestrian: few boxes" in text
 
 
@@ -142,11 +142,11 @@ def test_data_commands(tmp_path: Path) -> None:
     path = write_pandaset(tmp_path)
     done = CliRunner().invoke(app, ["check", str(path), "--frames", "2", "--json", str(tmp_path / "report.json")])
     assert done.exit_code == 0, done.output
-    assert "2 frames, 7200 points a frame" in done.output and "nothing looks wrong" in done.output
+    assert "2 frames, 7200 points per frame" in done.output and "nothing looks wrong" in done.output
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert report["classes"][0]["boxes"] == 16 and report["warnings"] == []
     done = CliRunner().invoke(app, ["anchors", str(path)])
-    assert done.exit_code == 0 and "{name: Car, size: [4.40, 1.80, 1.50], bottom: -1.73" in done.output
+    assert done.exit_code == 0 and "{name: Car, size: [4.40, 1.80, 1.50], bottom_z: -1.73" in done.output
     (tmp_path / "velodyne" / "01.bin").write_bytes(b"1")
     done = CliRunner().invoke(app, ["check", str(path)])
     assert done.exit_code == 2 and "1 of 3 frames cannot be read" in done.stderr

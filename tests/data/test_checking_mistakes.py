@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beambox.data.check_text import warnings
 from beambox.data.checking import check_frames
 from beambox.data.custom import CustomSource
+from beambox.data.format_report import warnings
 from beambox.data.kitti import KittiSource
 from oracles.own_data import SENSOR_HEIGHT, scene, write_pandaset, write_sweep
 
@@ -60,8 +60,8 @@ MISTAKES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
 def test_mistakes_of_labels_are_named(tmp_path: Path, name: str) -> None:
     change, wanted = MISTAKES[name]
     source = CustomSource(write_pandaset(tmp_path, 3, f"sensor_height: {SENSOR_HEIGHT}\n", change), whole=True)
-    told = warnings(check_frames(source))
-    assert any(wanted in line for line in told), told
+    lines = warnings(check_frames(source))
+    assert any(wanted in line for line in lines), lines
 
 
 def test_sound_labels_are_accused_of_nothing(tmp_path: Path) -> None:
@@ -69,17 +69,17 @@ def test_sound_labels_are_accused_of_nothing(tmp_path: Path) -> None:
     assert warnings(check_frames(source)) == []
 
 
-def test_points_in_millimetres_and_on_their_head_are_named(tmp_path: Path) -> None:
+def test_points_in_millimeters_and_on_their_head_are_named(tmp_path: Path) -> None:
     path = write_pandaset(tmp_path, 2, "")
     for seed, factor in ((0, [1000, 1000, 1000, 1]), (1, [1000, 1000, 1000, 1])):
         write_sweep(tmp_path / f"velodyne/{seed:02d}.bin", scene(seed)[0] * np.array(factor))
-    told = warnings(check_frames(CustomSource(path, whole=True)))
-    assert any("these are millimetres or map coordinates" in line for line in told)
-    assert any("the points are in millimetres, the boxes in metres" in line for line in told)
+    lines = warnings(check_frames(CustomSource(path, whole=True)))
+    assert any("these are millimetres or map coordinates" in line for line in lines)
+    assert any("the points are in millimetres, the boxes in metres" in line for line in lines)
     for seed in (0, 1):
         write_sweep(tmp_path / f"velodyne/{seed:02d}.bin", scene(seed)[0] * np.array([1, -1, -1, 1]))
-    told = warnings(check_frames(CustomSource(path, whole=True)))
-    assert any("-z is up, but z is expected to be: set axes" in line for line in told), told
+    lines = warnings(check_frames(CustomSource(path, whole=True)))
+    assert any("-z is up, but z is expected to be: set axes" in line for line in lines), lines
 
 
 def test_an_intensity_scaled_differently_from_frame_to_frame_is_named(tmp_path: Path) -> None:
@@ -87,8 +87,8 @@ def test_an_intensity_scaled_differently_from_frame_to_frame_is_named(tmp_path: 
     path = write_pandaset(tmp_path, 3, f"sensor_height: {SENSOR_HEIGHT}\n")
     for seed, top in ((0, 250), (1, 4000), (2, 4000)):
         write_sweep(tmp_path / f"velodyne/{seed:02d}.bin", scene(seed)[0] * np.array([1, 1, 1, top]))
-    told = warnings(check_frames(CustomSource(path, whole=True)))
-    assert any("intensity was divided by 255 in 1 frames, by 65535 in 2 frames" in line for line in told), told
+    lines = warnings(check_frames(CustomSource(path, whole=True)))
+    assert any("intensity was divided by 255 in 1 frames, by 65535 in 2 frames" in line for line in lines), lines
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from beambox.data.box_files import CAMERA_AT_THE_SENSOR
 from beambox.data.custom import CustomSource
 from beambox.data.kitti_calibration import format_calibration
 from beambox.data.kitti_text import format_labels
-from beambox.data.opening import open_data
+from beambox.data.open_dataset import open_dataset
 from beambox.data.source import FrameSource
 from beambox.structures import Labels
 from oracles.own_data import SENSOR_HEIGHT, scene, write_pandaset, write_sweep
@@ -80,9 +80,9 @@ def folder(tmp_path: Path) -> tuple[Path, str]:
     return tmp_path, write_pandaset(tmp_path).read_text(encoding="utf-8")
 
 
-def equal_boxes(got: CustomSource, wanted: CustomSource) -> None:
+def equal_boxes(actual: CustomSource, wanted: CustomSource) -> None:
     for i in range(len(wanted)):
-        a, b = got.labels(i), wanted.labels(i)
+        a, b = actual.labels(i), wanted.labels(i)
         assert a is not None and b is not None and a.names == b.names
         np.testing.assert_allclose(a.boxes, b.boxes, atol=2e-3)
 
@@ -166,7 +166,7 @@ def test_splits_are_lists_of_names(folder: tuple[Path, str]) -> None:
     (root / "val.txt").write_text("02\n00\n", encoding="utf-8")
     yaml = rewrite(root, config, splits="{val: val.txt}")
     assert list(CustomSource(yaml, "val").ids) == ["02", "00"]
-    assert isinstance(open_data(yaml, "val"), CustomSource)
+    assert isinstance(open_dataset(yaml, "val"), CustomSource)
     with pytest.raises(BeamboxError, match=r'has no split "vale" \(did you mean "val"\?\)'):
         CustomSource(yaml, "vale")
     (root / "val.txt").write_text("02\n02\n", encoding="utf-8")
@@ -189,7 +189,7 @@ def test_splits_are_lists_of_names(folder: tuple[Path, str]) -> None:
         ({"ground_slope": "{left: 3}"}, "ground_slope.left: Input should be less than or equal to 0.3"),
         ({"ground_slope": "{right: 0}"}, "ground_slope.right: Extra inputs are not permitted"),
         ({"sensor_height": "high"}, "sensor_height: Input should be a valid number"),
-        ({"labels": "all.txt"}, r"boxes in pandaset format come as one file a frame"),
+        ({"labels": "all.txt"}, r"boxes in pandaset format come as one file per frame"),
         ({"points": "none/{frame}.bin"}, r"none, the folder of the sweeps, is not there"),
         ({"points": "boxes/{frame}.pcd"}, r"holds no sweep \*\.pcd"),
     ],
@@ -250,7 +250,7 @@ def test_missing_sweep_is_named(folder: tuple[Path, str]) -> None:
     with pytest.raises(MissingFileError, match=r"velodyne/02\.bin is not there, the sweep of frame 02"):
         source[2]
     with pytest.raises(MissingFileError, match="is not there; give a data set's folder"):
-        open_data(root / "none")
+        open_dataset(root / "none")
 
 
 OPEN_CUSTOM = """
@@ -272,7 +272,7 @@ def test_custom_index_of_a_million_frames_opens_fast_and_small(folder: tuple[Pat
     yaml = rewrite(root, config, splits="{train: train.txt}")
     env = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     command = [sys.executable, "-c", OPEN_CUSTOM, str(yaml)]
-    told = subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout.split()
-    assert told[:2] == ["1000000", "drive_0999/999999"]
-    assert float(told[2]) < 10, f"{told[2]} s of one core"
-    assert float(told[3]) < 1e9, f"{told[3]} bytes"
+    output = subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout.split()
+    assert output[:2] == ["1000000", "drive_0999/999999"]
+    assert float(output[2]) < 10, f"{output[2]} s of one core"
+    assert float(output[3]) < 1e9, f"{output[3]} bytes"

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.database import ObjectDatabase
 from beambox.data.kitti import KittiSource
+from beambox.data.sampling import shuffled_indices
 from beambox.data.source import FrameList
-from beambox.data.walk import walk
 from beambox.structures import ImageAttributes, Labels
 from oracles.paths import data_dir
 from oracles.scenes import scene
@@ -23,11 +23,11 @@ from oracles.scenes import scene
 
 @given(st.integers(1, 30), st.integers(0, 100), st.integers(0, 60), st.integers(0, 5))
 def test_a_walk_visits_everything_once_a_pass(size: int, start: int, count: int, seed: int) -> None:
-    whole = walk(size, 0, 8 * size, (seed,))
-    for turn in range(8):
-        assert sorted(whole[turn * size : (turn + 1) * size]) == list(range(size))
-    assert walk(size, start, count, (seed,)).tolist() == [
-        int(walk(size, k, 1, (seed,))[0]) for k in range(start, start + count)
+    whole = shuffled_indices(size, 0, 8 * size, (seed,))
+    for draw_index in range(8):
+        assert sorted(whole[draw_index * size : (draw_index + 1) * size]) == list(range(size))
+    assert shuffled_indices(size, start, count, (seed,)).tolist() == [
+        int(shuffled_indices(size, k, 1, (seed,))[0]) for k in range(start, start + count)
     ]
 
 
@@ -38,9 +38,9 @@ def test_objects_are_cut_with_their_points() -> None:
     labels = frames[1].labels
     assert labels is not None
     np.testing.assert_array_equal(base.boxes[4:8], labels.boxes.numpy())
-    got = base.points_of(np.array([4, 6]), base.boxes[[4, 6], :3])
+    actual = base.points_of(np.array([4, 6]), base.boxes[[4, 6], :3])
     expected = torch.cat((frames[1].points[:30], frames[1].points[60:90])).numpy()
-    np.testing.assert_allclose(got, expected, atol=1e-5)
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
     assert base.points_of(np.zeros(0, dtype=np.int64), np.zeros((0, 3))).shape == (0, 4)
 
 
@@ -60,7 +60,7 @@ def test_small_and_unknown_objects_are_left_out() -> None:
 
 def test_draws_walk_through_all_objects() -> None:
     base = ObjectDatabase.build(FrameList([scene(k) for k in range(5)]), ["Car"])
-    drawn = np.concatenate([base.draw("Car", 5, turn, seed=3) for turn in range(4)])
+    drawn = np.concatenate([base.draw("Car", 5, draw_index, seed=3) for draw_index in range(4)])
     assert sorted(drawn.tolist()) == list(range(20))
     assert base.draw("Car", 5, 2, 3).tolist() == base.draw("Car", 5, 2, 3).tolist()
     assert base.draw("Car", 5, 2, 3).tolist() != base.draw("Car", 5, 2, 4).tolist()
@@ -76,7 +76,9 @@ def test_whatever_is_present_no_object_comes_twice_in_a_pass() -> None:
         boxes, np.zeros((24, 4), np.float32), np.arange(25), np.zeros(24, np.int64), ("Car",), ("",) * 24
     )
     nothing, cars = np.zeros((0, 7), np.float32), [("Car", 6)]
-    drawn = [base.sample(nothing, cars, turn, 0, {"Car": here})[0] for turn, here in enumerate((0, 3, 4, 9))]
+    drawn = [
+        base.sample(nothing, cars, draw_index, 0, {"Car": here})[0] for draw_index, here in enumerate((0, 3, 4, 9))
+    ]
     assert [len(some) for some in drawn] == [6, 3, 2, 0]
     assert len(set(np.concatenate(drawn).tolist())) == 11
     assert base.sample(nothing, cars, 1, 0, {"Van": 5})[0].tolist() == base.sample(nothing, cars, 1, 0)[0].tolist()

@@ -26,8 +26,8 @@ from beambox.data.folder import parse_boxes
 from beambox.data.kitti_calibration import read_calibration
 from beambox.data.kitti_text import read_labels
 from beambox.data.once import OnceSource
-from beambox.data.reading import read_frame
-from beambox.detectors.catalogue import build
+from beambox.data.read_points import read_frame
+from beambox.detectors.catalog import build
 from beambox.detectors.weights import load_weights, save_weights
 from beambox.geometry import Calibration
 from beambox.infer.results import read_result, write_results
@@ -143,7 +143,7 @@ def write_once(path: Path) -> None:
 
 def read_once(path: Path) -> None:
     (path.parent / "once" / "data" / "000000" / "000000.json").write_bytes(path.read_bytes())
-    OnceSource(path.parent / "once", "all", labelled=False)
+    OnceSource(path.parent / "once", "all", labeled=False)
 
 
 def write_annotations(path: Path) -> None:

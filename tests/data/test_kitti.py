@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beambox.checks import BeamboxError, MissingFileError
+from beambox.data.ground_plane import fit_ground_plane
 from beambox.data.kitti import (
     KittiSource,
     format_calibration,
@@ -27,7 +28,6 @@ from beambox.data.kitti import (
     write_split,
 )
 from beambox.data.kitti_text import parse_plane
-from beambox.data.road import fit_road_plane
 from beambox.geometry import Calibration
 from beambox.structures import Frame, Labels
 from oracles.paths import data_dir
@@ -272,7 +272,7 @@ def test_every_real_frame_reads() -> None:
     source = KittiSource(data_dir("kitti"), "val", fov=True)
     for index in range(0, len(source), 6):
         read = source[index]
-        plane = fit_road_plane(read.points)
+        plane = fit_ground_plane(read.points)
         assert read.labels is not None and read.plane is None and read.image_size is not None
         assert len(read) > 5000 and float(read.points[:, 3].max()) <= 1
         assert plane is not None and 1.4 < float(plane[3]) < 2.1  # the sensor stands 1.73 m above the road

@@ -204,7 +204,7 @@ def test_what_is_written_is_read_whatever_classes_are_called(tmp_path: Path, nam
     assert read is not None and read.names == (name,)
 
 
-def test_regions_that_nobody_labelled_are_told_in_any_case() -> None:
+def test_regions_that_nobody_labeled_are_told_in_any_case() -> None:
     line = "dontcare -1 -1 -10 503 169 590 190 -1 -1 -1 -1000 -1000 -1000 -10\n"
     labels = parse_labels(line, EXPECTED)
     assert len(labels) == 0 and len(labels.ignored_image) == 1

@@ -13,9 +13,9 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.cli.main import main
 from beambox.data.custom import CustomSource
-from beambox.data.labels.catalogue import FORMATS, parse_labels, read_labels, write_labels
+from beambox.data.labels.catalog import FORMATS, parse_labels, read_labels, write_labels
 from beambox.data.labels.convert import convert_labels, heading_note
-from beambox.data.labels.frames import LabelledFrame
+from beambox.data.labels.frames import LabeledFrame
 from beambox.geometry.boxes import corners_3d
 
 BOXES = np.array(
@@ -28,10 +28,10 @@ BOXES = np.array(
 NAMES = ("Car", "Pedestrian", "Construction Vehicle")
 
 
-def frames() -> dict[str, LabelledFrame]:
+def frames() -> dict[str, LabeledFrame]:
     return {
-        "000000": LabelledFrame(NAMES, BOXES, ("7", "9", "12")),
-        "000001": LabelledFrame(NAMES[:1], BOXES[:1] + 0.25, ("7",)),
+        "000000": LabeledFrame(NAMES, BOXES, ("7", "9", "12")),
+        "000001": LabeledFrame(NAMES[:1], BOXES[:1] + 0.25, ("7",)),
     }
 
 
@@ -52,7 +52,7 @@ def test_round_trips_are_exact(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [kind for kind, form in FORMATS.items() if form.write_frame])
 def test_a_frame_without_boxes_stays_one(kind: str, tmp_path: Path) -> None:
-    write_labels({"a/000001": LabelledFrame((), np.zeros((0, 7)))}, kind, tmp_path)
+    write_labels({"a/000001": LabeledFrame((), np.zeros((0, 7)))}, kind, tmp_path)
     found, _ = read_labels(tmp_path, kind)
     assert list(found) == ["a/000001"] and len(found["a/000001"]) == 0
 
@@ -208,9 +208,9 @@ def test_files_written_from_the_documentation_are_read(kind: str) -> None:
 
 def test_vertices_are_the_corners_of_the_box() -> None:
     """The same eight points as :func:`corners_3d`, whatever their order."""
-    made = FORMATS["labelcloud_vertices"].write_frame
-    assert made is not None
-    for k, one in enumerate(made(frames()["000000"], "a")["objects"]):
+    write = FORMATS["labelcloud_vertices"].write_frame
+    assert write is not None
+    for k, one in enumerate(write(frames()["000000"], "a")["objects"]):
         ours = corners_3d(torch.from_numpy(BOXES[k : k + 1]))[0].numpy()
         theirs = np.array(one["vertices"])
         np.testing.assert_allclose(theirs[np.lexsort(theirs.T.round(6))], ours[np.lexsort(ours.T.round(6))], atol=1e-9)
@@ -230,7 +230,7 @@ def test_boxes_that_lean_and_boxes_longer_across_are_mentioned() -> None:
     leaning = json.loads(json.dumps(DOCUMENTED["sustechpoints"]))
     leaning[0]["psr"]["rotation"]["x"] = 0.2
     assert "lean by up to 11.5 degrees" in parse_labels(json.dumps(leaning), "sustechpoints", "file", "a")[1][0]
-    swapped = LabelledFrame(("Car",) * 4, np.tile([10, 2, 0, 1.8, 4.2, 1.5, 0.0], (4, 1)))
+    swapped = LabeledFrame(("Car",) * 4, np.tile([10, 2, 0, 1.8, 4.2, 1.5, 0.0], (4, 1)))
     assert "4 of 4 boxes longer than 2.5 m are longer across" in (heading_note({"a": swapped}) or "")
     assert heading_note(frames()) is None
 
@@ -261,7 +261,7 @@ def test_faults_name_the_place(kind: str, content: object, fault: str) -> None:
 
 def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BeamboxError, match="a name must be"):
-        write_labels({"../x": LabelledFrame((), np.zeros((0, 7)))}, "openpcdet", tmp_path / "out")
+        write_labels({"../x": LabeledFrame((), np.zeros((0, 7)))}, "openpcdet", tmp_path / "out")
     assert not list(tmp_path.glob("*.txt"))
 
 

@@ -14,16 +14,16 @@ OTHER = FrameList([scene(50 + k, ground=20) for k in range(4)])
 
 
 def test_an_epoch_visits_every_frame_in_its_own_order() -> None:
-    orders = [MixedSource([SOURCE, OTHER]).order(1, epoch).tolist() for epoch in (0, 1, 0)]
+    orders = [MixedSource([SOURCE, OTHER]).epoch_indices(1, epoch).tolist() for epoch in (0, 1, 0)]
     assert sorted(orders[0]) == sorted(orders[1]) == list(range(14))
     assert orders[0] == orders[2] != orders[1]
-    assert orders[0] != MixedSource([SOURCE, OTHER]).order(2, 0).tolist()
+    assert orders[0] != MixedSource([SOURCE, OTHER]).epoch_indices(2, 0).tolist()
 
 
 def test_a_mixture_takes_its_shares_and_repeats_late() -> None:
     mixed = MixedSource([SOURCE, OTHER], weights=[1, 3], epoch_length=8)
     assert len(mixed) == 14 and mixed.ids[10] == "1:000050" and mixed[12].id == "000052"
-    orders = [mixed.order(0, k).tolist() for k in range(5)]
+    orders = [mixed.epoch_indices(0, k).tolist() for k in range(5)]
     assert all(sum(i >= 10 for i in order) == 6 and len(order) == 8 for order in orders)
     assert sorted(i for order in orders for i in order if i < 10) == list(range(10))
     assert sorted(i for order in orders[:2] for i in order if i >= 10) == sorted([10, 11, 12, 13] * 3)

@@ -11,7 +11,7 @@ import pytest
 
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.nuscenes import NuScenesSource
-from beambox.data.opening import open_data
+from beambox.data.open_dataset import open_dataset
 
 HALF = math.sqrt(0.5)
 EGO = {
@@ -74,7 +74,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_points_and_boxes_agree_in_the_turned_frame(root: Path) -> None:
-    source = open_data(root, "all")
+    source = open_dataset(root, "all")
     assert isinstance(source, NuScenesSource) and list(source.ids) == ["a", "b"]
     first, second = source[0], source[1]
     assert first.points[0].tolist() == pytest.approx([12, 5, -1, 0.5])  # ahead, left, up; intensity / 255

@@ -50,17 +50,17 @@ def same(a: Frame, b: Frame) -> None:
 
 
 def test_once_reading_and_writing_are_inverse(root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    first = OnceSource(root, "val", labelled=False)
+    first = OnceSource(root, "val", labeled=False)
     assert isinstance(first, FrameSource)
     assert list(first.ids) == ["100", "101", "102", "200"]
     again = tmp_path_factory.mktemp("again")
     write_once_sequence(again, "000001", (first[i] for i in range(3)))
     write_once_sequence(again, "000002", [first[3]])
     write_once_split(again, "val", ["000001", "000002"])
-    second = OnceSource(again, "val", labelled=False)
+    second = OnceSource(again, "val", labeled=False)
     rng = np.random.default_rng(0)
-    made = [frame(rng, "100", 3), frame(rng, "101", None), frame(rng, "102", 0), frame(rng, "200", 5)]
-    for i, wanted in enumerate(made):
+    source_frames = [frame(rng, "100", 3), frame(rng, "101", None), frame(rng, "102", 0), frame(rng, "200", 5)]
+    for i, wanted in enumerate(source_frames):
         same(first[i], wanted)
         same(second[i], first[i])
     for sequence in ("000001", "000002"):
@@ -69,11 +69,11 @@ def test_once_reading_and_writing_are_inverse(root: Path, tmp_path_factory: pyte
         ).read_text()
 
 
-def test_once_keeps_labelled_frames_with_boxes(root: Path) -> None:
+def test_once_keeps_labeled_frames_with_boxes(root: Path) -> None:
     assert list(OnceSource(root, "val").ids) == ["100", "200"]
     assert list(OnceSource(root, "val", keep_empty=True).ids) == ["100", "102", "200"]
-    assert list(OnceSource(root, "all", labelled=False).ids) == ["100", "101", "102", "200"]
-    source = OnceSource(root, "val", labelled=False)
+    assert list(OnceSource(root, "all", labeled=False).ids) == ["100", "101", "102", "200"]
+    source = OnceSource(root, "val", labeled=False)
     assert source.labels(1) is None and source[-1].id == "200"
     last = source.labels(-1)
     assert last is not None and len(last) == 5
@@ -201,9 +201,9 @@ def test_once_index_of_a_million_frames_opens_fast_and_small(tmp_path: Path) -> 
         )
     write_once_split(tmp_path, "raw", names)
     command = [sys.executable, "-c", OPEN_ONCE, str(tmp_path)]
-    told = subprocess.run(
+    output = subprocess.run(
         command, capture_output=True, text=True, check=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")}
     ).stdout.split()
-    assert told[:2] == ["1000000", str(1616343528200 + 499 * 10**6 + 1999 * 500)]
-    assert float(told[2]) < 10, f"{told[2]} s of one core"
-    assert float(told[3]) < 1e9, f"{told[3]} bytes"
+    assert output[:2] == ["1000000", str(1616343528200 + 499 * 10**6 + 1999 * 500)]
+    assert float(output[2]) < 10, f"{output[2]} s of one core"
+    assert float(output[3]) < 1e9, f"{output[3]} bytes"

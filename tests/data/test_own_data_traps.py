@@ -190,7 +190,7 @@ def test_names_of_once_s_frames_and_sequences_stay_in_the_folder(tmp_path: Path,
     content["frames"][0]["frame_id"] = name
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(BeamboxError, match="plain file name"):
-        OnceSource(tmp_path, "all", labelled=False)
+        OnceSource(tmp_path, "all", labeled=False)
 
 
 @pytest.mark.parametrize(

@@ -29,15 +29,15 @@ def field(name: str, offset: int, datatype: int, count: int = 1) -> SimpleNamesp
 
 
 def cloud(**changes: Any) -> SimpleNamespace:
-    made = {
+    cloud_message = {
         "height": 1, "width": N, "fields": [field(*one) for one in FIELDS], "is_bigendian": False, "point_step": STEP,
         "row_step": N * STEP, "data": packed(), "is_dense": True,
     }  # fmt: skip
-    return SimpleNamespace(**{**made, **changes})
+    return SimpleNamespace(**{**cloud_message, **changes})
 
 
-def check(made: SimpleNamespace, note: str = "") -> None:
-    columns = cloud_columns(made, "a.bag")
+def check(cloud_message: SimpleNamespace, note: str = "") -> None:
+    columns = cloud_columns(cloud_message, "a.bag")
     found = dict(zip(columns.names, columns.arrays))
     assert np.array_equal(np.stack([found[axis] for axis in "xyz"], axis=1), XYZ)
     assert found["intensity"].tolist() == [20 * k for k in range(N)]
@@ -77,8 +77,8 @@ def test_headers_that_are_wrong_somewhere(changes: dict[str, Any], note: str) ->
 @pytest.mark.parametrize("last", [True, False])
 def test_rows_that_end_in_padding(row_step: int, note: str, last: bool) -> None:
     rows = np.concatenate((packed().reshape(2, -1), np.zeros((2, 6), np.uint8)), axis=1).reshape(-1)
-    made = cloud(height=2, width=5, row_step=row_step, data=rows if last else rows[:-6])
-    check(made, note)
+    cloud_message = cloud(height=2, width=5, row_step=row_step, data=rows if last else rows[:-6])
+    check(cloud_message, note)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_two_messages_of_one_time_are_two_sweeps(tmp_path: Path) -> None:
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
-    from beambox.data.reading import read_frame
+    from beambox.data.read_points import read_frame
     from beambox.infer.inputs import find_sweeps
 
     store = get_typestore(Stores.ROS1_NOETIC)
@@ -118,10 +118,12 @@ def test_two_messages_of_one_time_are_two_sweeps(tmp_path: Path) -> None:
     with Writer(tmp_path / "a.bag") as writer:
         connection = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=store)
         for k in range(3):
-            made = vars(cloud(data=packed() if k != 1 else packed()[::-1].copy()))
-            made["fields"] = [types["sensor_msgs/msg/PointField"](**vars(one)) for one in made["fields"]]
+            cloud_message = vars(cloud(data=packed() if k != 1 else packed()[::-1].copy()))
+            cloud_message["fields"] = [
+                types["sensor_msgs/msg/PointField"](**vars(one)) for one in cloud_message["fields"]
+            ]
             head = types["std_msgs/msg/Header"](seq=0, stamp=time, frame_id="l")
-            message = types["sensor_msgs/msg/PointCloud2"](header=head, **made)
+            message = types["sensor_msgs/msg/PointCloud2"](header=head, **cloud_message)
             writer.write(connection, 5, store.serialize_ros1(message, "sensor_msgs/msg/PointCloud2"))
     found = find_sweeps([tmp_path / "a.bag"])
     assert [sweep.name for sweep in found] == ["5", "5-2", "5-3"]

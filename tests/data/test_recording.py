@@ -13,7 +13,7 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.data.formats import columns
 from beambox.data.formats.recording import sweeps_in
-from beambox.data.reading import read_frame
+from beambox.data.read_points import read_frame
 from beambox.infer.inputs import find_sweeps, read_sweep
 from beambox.infer.predictor import Detector
 from oracles.tiny_detector import tiny_model
@@ -35,12 +35,12 @@ def points(seed: int, rows: int = 2, width: int = 5) -> np.ndarray:
     names, offsets, _ = zip(*FIELDS)
     layout = np.dtype({"names": names, "formats": numbers, "offsets": offsets, "itemsize": STEP})
     rng = np.random.default_rng(seed)
-    made = np.zeros((rows, width), layout)
+    structured = np.zeros((rows, width), layout)
     for name in "xyz":
-        made[name] = rng.uniform(-20, 20, (rows, width))
-    made["intensity"] = rng.integers(0, 256, (rows, width))
-    made["ring"] = rng.integers(0, 64, (rows, width))
-    return made
+        structured[name] = rng.uniform(-20, 20, (rows, width))
+    structured["intensity"] = rng.integers(0, 256, (rows, width))
+    structured["ring"] = rng.integers(0, 64, (rows, width))
+    return structured
 
 
 def message(store: Any, cloud: np.ndarray, ros1: bool) -> Any:
@@ -78,8 +78,8 @@ def record(folder: Path, kind: str, topics: tuple[str, ...] = ("/lidar/top",)) -
         for topic in topics:
             connection = writer.add_connection(topic, "sensor_msgs/msg/PointCloud2", typestore=store)
             for k in range(3):
-                made = message(store, points(k), kind == "bag")
-                writer.write(connection, 10**9 + k * 10**8, write(made, "sensor_msgs/msg/PointCloud2"))
+                structured = message(store, points(k), kind == "bag")
+                writer.write(connection, 10**9 + k * 10**8, write(structured, "sensor_msgs/msg/PointCloud2"))
     return next(path.glob("*.mcap")) if kind == "mcap file" else path
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from beambox.checks import BeamboxError
 from beambox.data.formats.unpacking import FREE, RATIO, unpack
-from beambox.data.reading import read_frame
+from beambox.data.read_points import read_frame
 from beambox.infer.inputs import find_sweeps
 
 pytest.importorskip("rosbags")

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import build
-from beambox.detectors.dennet import AttentionPosition, CountSet, DenNetConfig, DensityBranch, Normalisation, normalised
+from beambox.detectors.catalog import build
+from beambox.detectors.dennet import AttentionPosition, CountSet, DenNetConfig, DensityBranch, Normalization, normalized
 from beambox.detectors.hcnet import AdaptiveAdjustment, Gate, HCNetConfig, HeightChannelFusion, HeightChannelKind
-from beambox.detectors.kassd import ExtraPoint, KamOptions, KamScore, KassdConfig, KeypointLayout, LamReduce, Neck
+from beambox.detectors.kassd import ExtraPoint, KamOptions, KamScore, KASSDConfig, KeypointLayout, LamReduce, Neck
 from beambox.detectors.kassd.network import LocationAttention, location_attention
 
 CELL = (0.1, 0.1, 0.15)
@@ -25,11 +25,11 @@ MEANT: list[tuple[Callable[[Any], Any], str, Any]] = [
     (lambda word: HCNetConfig(aam_gate=word).aam_gate, "sigmoid", Gate.SIGMOID),
     (lambda word: DenNetConfig(na_position=word).na_position, "middle", AttentionPosition.MIDDLE),
     (lambda word: DenNetConfig(count_set=word).count_set, "points", CountSet.POINTS),
-    (lambda word: DenNetConfig(normalisation=word).normalisation, "log", Normalisation.LOG),
+    (lambda word: DenNetConfig(normalization=word).normalization, "log", Normalization.LOG),
     (lambda word: DensityBranch(count_set=word).count_set, "points", CountSet.POINTS),
-    (lambda word: DensityBranch(normalisation=word).normalisation, "raw", Normalisation.RAW),
-    (lambda word: KassdConfig(neck=word).neck, "psa", Neck.PSA),
-    (lambda word: KassdConfig(lam_reduce=word).lam_reduce, "mean", LamReduce.MEAN),
+    (lambda word: DensityBranch(normalization=word).normalization, "raw", Normalization.RAW),
+    (lambda word: KASSDConfig(neck=word).neck, "psa", Neck.PSA),
+    (lambda word: KASSDConfig(lam_reduce=word).lam_reduce, "mean", LamReduce.MEAN),
     (lambda word: KamOptions(score=word).score, "multiply", KamScore.MULTIPLY),
     (lambda word: KeypointLayout(extra_point=word).extra_point, "center", ExtraPoint.CENTER),
     (lambda word: LocationAttention(4, 4, reduce=word).reduce, "mean", LamReduce.MEAN),
@@ -48,9 +48,9 @@ def test_a_word_is_its_option_and_another_is_refused(make: Callable[[Any], Any],
 
 def test_functions_take_the_word_too() -> None:
     count = torch.tensor([1, 5])
-    torch.testing.assert_close(normalised(count, 0.6, CELL, "log"), torch.log1p(count.float()))
+    torch.testing.assert_close(normalized(count, 0.6, CELL, "log"), torch.log1p(count.float()))
     with pytest.raises(BeamboxError, match=r'`how` must be .* got \'lag\' \(did you mean "log"\?\)'):
-        normalised(count, 0.6, CELL, "lag")
+        normalized(count, 0.6, CELL, "lag")
     torch.testing.assert_close(
         location_attention(2 * MAP, MAP, "mean"), location_attention(2 * MAP, MAP, LamReduce.MEAN)
     )

@@ -9,7 +9,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.detectors import voxel_rcnn as voxel_rcnn_module
-from beambox.detectors.catalogue import build, config_from_dict, config_to_dict
+from beambox.detectors.catalog import build, config_from_dict, config_to_dict
 from beambox.detectors.dennet import (
     KITTI_005,
     KITTI_Z4,
@@ -20,17 +20,17 @@ from beambox.detectors.dennet import (
     DenNet,
     DenNetConfig,
     NeighborhoodBlock,
-    Normalisation,
+    Normalization,
     dennet,
 )
-from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
+from beambox.detectors.voxel_rcnn import VoxelRCNNConfig, voxel_rcnn
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.structures import Batch
 from beambox.train.config import read_recipe
 from oracles.learning import check_found, learn_by_heart, scan_with_cars
 from oracles.scenes import scene
-from oracles.small_detectors import CAR, DENNET, TWO_STAGES, car_frame, made
+from oracles.small_detectors import CAR, DENNET, TWO_STAGES, build_small, car_frame
 
 FULL = DenNetConfig()
 OFF = {"vda": False, "na": False, "ca": False}
@@ -69,7 +69,7 @@ def test_each_switch_removes_exactly_its_parameters() -> None:
     for same in (
         {"na_position": AttentionPosition.MIDDLE},
         {"count_set": CountSet.POINTS},
-        {"normalisation": Normalisation.RAW},
+        {"normalisation": Normalization.RAW},
         {"max_count": 16},
     ):
         assert size_of(replace(FULL, **same)) == full
@@ -77,14 +77,14 @@ def test_each_switch_removes_exactly_its_parameters() -> None:
 
 def test_without_its_parts_it_is_voxel_rcnn() -> None:
     plain = dennet(replace(DENNET, **OFF)).eval()
-    other = voxel_rcnn(VoxelRcnnConfig(grid=DENNET.grid, pooling=DENNET.pooling, **TWO_STAGES)).eval()
+    other = voxel_rcnn(VoxelRCNNConfig(grid=DENNET.grid, pooling=DENNET.pooling, **TWO_STAGES)).eval()
     flat = {name.replace(".convolutions.", "."): value for name, value in plain.state_dict().items()}
     other.load_state_dict(flat)
     batch = Batch.of([car_frame(1, CAR)])
     with torch.inference_mode():
         ours, theirs = plain(batch), other(batch)
     torch.testing.assert_close(ours.first.cls, theirs.first.cls)
-    torch.testing.assert_close(ours.refined.codes, theirs.refined.codes)
+    torch.testing.assert_close(ours.refined.deltas, theirs.refined.deltas)
 
 
 def test_the_defaults_are_the_papers_setting() -> None:
@@ -111,7 +111,7 @@ def test_the_defaults_are_the_papers_setting() -> None:
         (("voxel_rcnn-once",), voxel_rcnn_module.ONCE),
     ],
 )
-def test_recipes_hold_the_named_settings(name: tuple[str, ...], config: VoxelRcnnConfig) -> None:
+def test_recipes_hold_the_named_settings(name: tuple[str, ...], config: VoxelRCNNConfig) -> None:
     recipe = read_recipe(name[0], name[1:])
     assert config_from_dict(type(config), recipe.detector.options) == config
     assert (recipe.optim.lr, recipe.optim.epochs, recipe.optim.batch) == (0.003, 100, 8)
@@ -128,7 +128,7 @@ def test_where_attention_stands_in_a_stage(position: AttentionPosition, at: int)
 
 
 def test_density_reaches_the_map_beside_the_encoders() -> None:
-    small = made("dennet").eval()
+    small = build_small("dennet").eval()
     seen = {}
     small.backbone.register_forward_pre_hook(lambda _, inputs: seen.update(maps=inputs[0]))
     batch = Batch.of([car_frame(1, CAR), car_frame(2)])
@@ -144,7 +144,7 @@ def test_options_are_read_as_plain_values() -> None:
     model = build("dennet", options)
     assert isinstance(model, DenNet)
     assert model.config.count_set is CountSet.POINTS and model.config.na_position is AttentionPosition.MIDDLE
-    with pytest.raises(BeamboxError, match=r"`normalisation`: .*'log-share', 'log', 'share' or 'raw', got 'sqrt'"):
+    with pytest.raises(BeamboxError, match=r"`normalization`: .*'log-share', 'log', 'share' or 'raw', got 'sqrt'"):
         build("dennet", {"normalisation": "sqrt"})
 
 
@@ -157,7 +157,7 @@ def test_wrong_options_are_refused() -> None:
 
 def test_learns_two_cars() -> None:
     grid = VoxelGrid((0.0, -20.8, -3.0), (46.4, 20.8, 3.0), (0.4, 0.4, 0.15))
-    model = made("dennet", replace(DENNET, grid=grid))
+    model = build_small("dennet", replace(DENNET, grid=grid))
     losses = learn_by_heart(model, scene(3, objects=2, per_object=120), 40, 0.01, clip=10)
     assert sum(losses[-5:]) / 5 < 0.35 * losses[0]
 
@@ -166,8 +166,8 @@ def test_learns_two_cars() -> None:
 def test_overfits_a_real_scan() -> None:
     grid = VoxelGrid((0.0, -19.2, -3.0), (38.4, 19.2, 3.0), (0.1, 0.1, 0.15))
     frame = scan_with_cars(grid)
-    config = DenNetConfig(anchors=KITTI_ANCHORS[:1], grid=grid, depths=(1, 1), dropout=0.0, centred_anchors=True)
-    model = made("dennet", config)
+    config = DenNetConfig(anchors=KITTI_ANCHORS[:1], grid=grid, depths=(1, 1), dropout=0.0, centered_anchors=True)
+    model = build_small("dennet", config)
     for module in model.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
             module.momentum = 0.1  # the statistics must settle within these few steps

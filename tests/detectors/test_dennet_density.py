@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beambox.checks import BeamboxError
-from beambox.detectors.dennet import CountSet, DensityBranch, Normalisation, count_points, normalised, patch_cells
+from beambox.detectors.dennet import CountSet, DensityBranch, Normalization, count_points, normalized, patch_cells
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.encoders import VoxelEncoder, mean_voxels
 from beambox.ops.voxelize import Voxels, voxelize
@@ -48,27 +48,27 @@ def test_a_flat_patch_of_21_by_21_voxels(count_set: CountSet) -> None:
     assert features == pytest.approx([math.log(114) / 4.73705, math.log(442) / 6.92646], abs=1e-5)
 
 
-def test_normalisations() -> None:
+def test_normalizations() -> None:
     count = torch.tensor([1, 113, 441])
     assert patch_cells(0.6, CELL) == pytest.approx(113.0973, abs=1e-4)
     assert patch_cells(1.8, CELL) == pytest.approx(1017.876, abs=1e-3)
-    assert normalised(count, 0.6, CELL, Normalisation.RAW).tolist() == [1, 113, 441]
-    assert normalised(count, 0.6, CELL, Normalisation.SHARE)[1] == pytest.approx(113 / 113.0973, abs=1e-5)
-    assert normalised(count, 0.6, CELL, Normalisation.LOG)[2] == pytest.approx(math.log(442), abs=1e-5)
-    share = normalised(count, 0.6, CELL, Normalisation.LOG_SHARE)
+    assert normalized(count, 0.6, CELL, Normalization.RAW).tolist() == [1, 113, 441]
+    assert normalized(count, 0.6, CELL, Normalization.SHARE)[1] == pytest.approx(113 / 113.0973, abs=1e-5)
+    assert normalized(count, 0.6, CELL, Normalization.LOG)[2] == pytest.approx(math.log(442), abs=1e-5)
+    share = normalized(count, 0.6, CELL, Normalization.LOG_SHARE)
     assert share.tolist() == pytest.approx([math.log(1 + n) / math.log(114.0973) for n in (1, 113, 441)], abs=1e-5)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 300), st.integers(0, 600), st.sampled_from([0.3, 0.6, 1.8]))
-def test_points_are_counted_as_by_looking_at_all_pairs(seed: int, centres: int, points: int, radius: float) -> None:
+def test_points_are_counted_as_by_looking_at_all_pairs(seed: int, centers: int, points: int, radius: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     # a lattice of tenths, so that many distances are the radius itself
-    where = torch.randint(0, 30, (centres + points, 3), generator=generator) / 10
-    sample = torch.randint(0, 3, (centres + points,), generator=generator)
-    counted = count_points(where[:centres], sample[:centres], where[centres:], sample[centres:], radius)
-    away = (where[:centres, None].double() - where[None, centres:].double()).square().sum(dim=2)
-    near = (away <= radius**2 + 1e-6) & (sample[:centres, None] == sample[None, centres:])
+    where = torch.randint(0, 30, (centers + points, 3), generator=generator) / 10
+    sample = torch.randint(0, 3, (centers + points,), generator=generator)
+    counted = count_points(where[:centers], sample[:centers], where[centers:], sample[centers:], radius)
+    away = (where[:centers, None].double() - where[None, centers:].double()).square().sum(dim=2)
+    near = (away <= radius**2 + 1e-6) & (sample[:centers, None] == sample[None, centers:])
     assert counted.equal(near.sum(dim=1))
 
 

@@ -11,13 +11,13 @@ from torch import nn
 
 import beambox.detectors.voxel_rcnn
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import CATALOGUE, build, config_to_dict
+from beambox.detectors.catalog import CATALOG, build, config_to_dict
 from beambox.detectors.weights import load_weights, save_weights
-from beambox.infer.fusion import fold_batch_norms
+from beambox.infer.bn_folding import fold_batch_norms
 from beambox.layers.roi import Rois, propose
 from beambox.structures import Batch, Frame, Labels
 from oracles.learning import learn_by_heart
-from oracles.small_detectors import CAR, SMALL, VARIANTS, car_frame, first_stage, made, said, total
+from oracles.small_detectors import CAR, SMALL, VARIANTS, build_small, car_frame, first_stage, output_tensors, total
 
 ONE_STAGE = {"cls", "loc", "direction"}
 TWO_STAGES = ONE_STAGE | {"roi_cls", "roi_box", "roi_corner"}
@@ -34,13 +34,13 @@ CELLS = {"dennet": 64, "hcnet": 1024, "kassd": 256, "pointpillars": 1024, "secon
 
 
 def test_every_detector_has_a_small_one() -> None:
-    assert set(SMALL) == set(CATALOGUE)
+    assert set(SMALL) == set(CATALOG)
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", CATALOG)
 def test_dense_layers_hold_most_convolutions_on_maps(name: str) -> None:
     with torch.device("meta"):
-        model = CATALOGUE[name].build(CATALOGUE[name].config())
+        model = CATALOG[name].build(CATALOG[name].config())
     inside = sum(count(layer) for layer in model.dense)
     assert inside > 0.8 * count(model)
 
@@ -54,11 +54,11 @@ LONG_TO_COMPILE = ("hcnet", "kassd")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG_TO_COMPILE else ()) for name in CATALOGUE]
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG_TO_COMPILE else ()) for name in CATALOG]
 )
 def test_a_compiled_detector_says_and_learns_the_same(name: str) -> None:
     torch.compiler.reset()
-    plain, compiled = made(name).eval(), made(name).eval()
+    plain, compiled = build_small(name).eval(), build_small(name).eval()
     runs: list[Any] = []
 
     def backend(graph: Any, _: Any) -> Any:
@@ -79,14 +79,14 @@ def test_a_compiled_detector_says_and_learns_the_same(name: str) -> None:
     assert len(runs) == len(compiled.dense), "each layer is one graph without a break, and none is passed over"
     for key, gradient in gradients[0].items():
         torch.testing.assert_close(gradients[1][key], gradient, msg=lambda text, key=key: f"{key}: {text}")
-    torch.testing.assert_close(said(compiled(batch)), said(plain(batch)))
+    torch.testing.assert_close(output_tensors(compiled(batch)), output_tensors(plain(batch)))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_losses_reach_every_parameter(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     name = variant.split(":", maxsplit=1)[0]
     config = VARIANTS[variant]
-    model = made(name, config)
+    model = build_small(name, config)
     batch = Batch.of([car_frame(5, CAR), car_frame(6)])
 
     def some_found_the_car(*arguments: Any) -> Rois:
@@ -107,20 +107,20 @@ def test_losses_reach_every_parameter(variant: str, monkeypatch: pytest.MonkeyPa
     assert [key for key, grad in gradients.items() if not bool(grad.any())] == []
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", CATALOG)
 def test_samples_of_a_batch_do_not_touch_each_other(name: str) -> None:
-    model = made(name).eval()
+    model = build_small(name).eval()
     one, two = car_frame(3, CAR), car_frame(4, CAR)
     with torch.inference_mode():
-        alone, joined = said(model(Batch.of([two]))), said(model(Batch.of([one, two])))
+        alone, joined = output_tensors(model(Batch.of([two]))), output_tensors(model(Batch.of([one, two])))
     torch.testing.assert_close([part[1:] for part in joined], alone, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("training", [True, False])
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", CATALOG)
 def test_sweeps_without_points_give_predictions_a_loss_and_no_error(name: str, training: bool, count: int) -> None:
-    model = made(name).train(training)
+    model = build_small(name).train(training)
     empty = Frame(torch.zeros(0, 4), labels=Labels.empty())
     predictions = model(Batch.of([empty] * count))
     assert bool(first_stage(predictions).cls.isfinite().all())
@@ -133,9 +133,9 @@ def test_sweeps_without_points_give_predictions_a_loss_and_no_error(name: str, t
     assert [key for key, grad in gradients.items() if grad is None] == [], "DDP waits for every parameter"
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", CATALOG)
 def test_another_region_of_the_same_cells(name: str) -> None:
-    model = made(name).eval()
+    model = build_small(name).eval()
     window = SMALL[name].grid.window((8, 8), (40, 24))
     batch = Batch.of([car_frame(1, CAR)])
     with torch.inference_mode():
@@ -155,12 +155,12 @@ def test_is_built_by_name_and_survives_a_weight_file(variant: str, tmp_path: Pat
     assert type(again) is type(model) and again.config == model.config
     batch = Batch.of([car_frame(1, CAR)])
     with torch.inference_mode():
-        torch.testing.assert_close(said(again(batch)), said(model.eval()(batch)))
+        torch.testing.assert_close(output_tensors(again(batch)), output_tensors(model.eval()(batch)))
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", CATALOG)
 def test_folded_batch_norms_predict_the_same(name: str) -> None:
-    model = made(name)
+    model = build_small(name)
     batch = Batch.of([car_frame(1, CAR)])
     with torch.inference_mode():
         for layer in model.modules():
@@ -170,7 +170,7 @@ def test_folded_batch_norms_predict_the_same(name: str) -> None:
                 nn.init.normal_(layer.bias, 0, 0.2)
         model.train()(batch)
         folded = fold_batch_norms(model.eval())
-        plain, changed = said(model(batch)), said(folded(batch))
+        plain, changed = output_tensors(model(batch)), output_tensors(folded(batch))
     assert float(plain[0].std()) > 0.01, "a network that says the same everywhere would prove nothing"
     torch.testing.assert_close(changed, plain, rtol=0, atol=2e-5)
     assert not any(isinstance(layer, nn.BatchNorm2d) for part in folded.dense for layer in part.modules())
@@ -178,7 +178,7 @@ def test_folded_batch_norms_predict_the_same(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["pointpillars", "hcnet"])
 def test_overfits_two_cars_and_finds_them(name: str) -> None:
-    model = made(name)
+    model = build_small(name)
     cars = [6, 2, -1, 4.0, 1.7, 1.5, 0.4], [13, -4, -1, 3.7, 1.6, 1.5, -2.0]
     frame = car_frame(1, *cars, ground=1500, reach=20.0)
     losses = learn_by_heart(model, frame, 80, 0.01)
@@ -186,14 +186,14 @@ def test_overfits_two_cars_and_finds_them(name: str) -> None:
     (found,) = model.decode(model(Batch.of([frame])))
     best = found[:2].boxes.detach()
     best = best[best[:, 0].argsort()]
-    labelled = torch.tensor(cars)
-    torch.testing.assert_close(best[:, :2], labelled[:, :2], atol=0.3, rtol=0)
-    assert bool((torch.cos(best[:, 6] - labelled[:, 6]) > 0.9).all())
+    labeled = torch.tensor(cars)
+    torch.testing.assert_close(best[:, :2], labeled[:, :2], atol=0.3, rtol=0)
+    assert bool((torch.cos(best[:, 6] - labeled[:, 6]) > 0.9).all())
 
 
 @pytest.mark.parametrize("name", ["dennet", "kassd", "voxel_rcnn"])
 def test_predictions_to_learn_and_to_detect_are_not_mixed_up(name: str) -> None:
-    model = made(name).eval()
+    model = build_small(name).eval()
     batch = Batch.of([car_frame(1, CAR)])
     with torch.inference_mode():
         with pytest.raises(BeamboxError, match=r"call model\(batch, labels=labels\)"):
@@ -204,7 +204,7 @@ def test_predictions_to_learn_and_to_detect_are_not_mixed_up(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["dennet", "kassd", "voxel_rcnn"])
 def test_mixed_precision_covers_the_second_step_but_not_its_answers(name: str) -> None:
-    model = made(name)
+    model = build_small(name)
     hidden: list[torch.dtype] = []
     layer = model.kam.maps[0] if name == "kassd" else model.roi_head.shared[0]
     layer.register_forward_hook(lambda _module, _given, out: hidden.append(out.dtype))

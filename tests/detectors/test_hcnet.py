@@ -4,14 +4,14 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import build, config_from_dict
+from beambox.detectors.catalog import build, config_from_dict
 from beambox.detectors.hcnet import HCNET_CAR, Gate, HCNetConfig, HeightChannelKind, hcnet, pseudo_images
 from beambox.geometry.grid import VoxelGrid
 from beambox.ops.voxelize import voxelize
 from beambox.structures import Batch
 from beambox.train.config import read_recipe
 from oracles.learning import check_found, learn_by_heart, scan_with_cars
-from oracles.small_detectors import CAR, HCNET, car_frame, made
+from oracles.small_detectors import CAR, HCNET, build_small, car_frame
 
 PLAIN = replace(HCNET, oifm=False, aam=False)
 
@@ -40,7 +40,7 @@ def test_the_defaults_are_the_papers_setting() -> None:
     assert config.grid.size == (432, 496, 4)
     assert config.classes == ("Car",)
     (car,) = config.anchors
-    assert (car.size, car.matched, car.unmatched) == ((3.9, 1.6, 1.5), 0.6, 0.45)
+    assert (car.size, car.matched_threshold, car.unmatched_threshold) == ((3.9, 1.6, 1.5), 0.6, 0.45)
     assert (config.loss.loc, config.loss.cls, config.loss.direction) == (2.0, 1.0, 0.2)
 
 
@@ -50,7 +50,7 @@ def test_the_papers_recipe_is_the_defaults() -> None:
 
 
 def test_the_network_merges_pseudo_images_as_the_paper_writes_it() -> None:
-    model = made("hcnet").eval()
+    model = build_small("hcnet").eval()
     for parameter in model.fuse_slices.parameters():
         torch.nn.init.normal_(parameter)
     batch = Batch.of([car_frame(1, CAR, ground=1500, reach=20.0), car_frame(2)])
@@ -67,7 +67,7 @@ def test_the_network_merges_pseudo_images_as_the_paper_writes_it() -> None:
 def test_overfits_a_real_scan() -> None:
     grid = VoxelGrid((0, -20.48, -3), (40.96, 20.48, 1), (0.32, 0.32, 1))
     frame = scan_with_cars(grid)
-    model = made(
+    model = build_small(
         "hcnet",
         replace(HCNET, grid=grid, voxel_channels=32, widths=(32, 32, 64), up_widths=(32, 32, 32), head_width=32),
     )
@@ -91,7 +91,7 @@ def test_without_global_weights_a_window_agrees_with_the_whole_far_from_its_bord
 
 
 def test_a_map_of_odd_size_works() -> None:
-    model = made("hcnet").eval()
+    model = build_small("hcnet").eval()
     batch = Batch.of([car_frame(2, [10, 0, -1, 4.0, 1.7, 1.5, 0.0], ground=1500, reach=20.0)])
     predictions = model(batch, HCNET.grid.window((0, 0), (37, 45)))
     assert predictions.cls.shape == (1, 23 * 19 * 2, 1)
@@ -99,14 +99,14 @@ def test_a_map_of_odd_size_works() -> None:
 
 
 def test_a_region_with_other_slices_is_refused() -> None:
-    model = made("hcnet").eval()
+    model = build_small("hcnet").eval()
     flat = VoxelGrid(HCNET.grid.minimum, HCNET.grid.maximum, (0.32, 0.32, 4))
     with pytest.raises(BeamboxError, match="`grid` must have the 4 height slices of the network, got 1"):
         model(Batch.of([car_frame(1)]), flat)
 
 
 def test_a_wrong_number_of_stages_is_refused() -> None:
-    with pytest.raises(BeamboxError, match=r"`widths` must have 3 entries, one a stage, got 2: \[8, 8\]"):
+    with pytest.raises(BeamboxError, match=r"`widths` must have 3 entries, one per stage, got 2: \[8, 8\]"):
         replace(HCNET, widths=(8, 8))
     with pytest.raises(BeamboxError, match="`anchors` must name at least one class"):
         replace(HCNET, anchors=())
@@ -118,4 +118,4 @@ def test_a_wrong_attention_is_refused() -> None:
 
 
 def test_car_anchor_stands_on_the_ground_of_kitti() -> None:
-    assert HCNET_CAR.bottom + HCNET_CAR.size[2] / 2 == pytest.approx(-1.03)
+    assert HCNET_CAR.bottom_z + HCNET_CAR.size[2] / 2 == pytest.approx(-1.03)

@@ -7,8 +7,8 @@ from torch import nn
 
 from beambox.checks import BeamboxError
 from beambox.detectors.hcnet import (
+    CBAM,
     AdaptiveAdjustment,
-    Cbam,
     Gate,
     HeightChannelFusion,
     HeightChannelKind,
@@ -231,7 +231,7 @@ def test_an_even_strip_kernel_is_refused() -> None:
 
 def test_cbam_weighs_channels_then_places() -> None:
     torch.manual_seed(0)
-    module = Cbam(6, reduction=3).eval()
+    module = CBAM(6, reduction=3).eval()
     bev = torch.randn(2, 6, 8, 9)
     first, second = module.channel[0].weight, module.channel[2].weight
     for b in range(2):
@@ -244,5 +244,5 @@ def test_cbam_weighs_channels_then_places() -> None:
 
 
 def test_cbam_keeps_some_hidden_channels_in_narrow_maps() -> None:
-    assert Cbam(4, reduction=16).channel[0].weight.shape == (4, 4)
-    assert Cbam(448, reduction=16).channel[0].weight.shape == (28, 448)
+    assert CBAM(4, reduction=16).channel[0].weight.shape == (4, 4)
+    assert CBAM(448, reduction=16).channel[0].weight.shape == (28, 448)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.detectors.hcnet import HeightChannelFusion, HeightChannelKind
-from beambox.detectors.kassd import KassdConfig, LamReduce, kassd
+from beambox.detectors.kassd import KASSDConfig, LamReduce, kassd
 from beambox.detectors.kassd.network import LocationAttention
 from beambox.train.recipes import list_recipes
 from beambox.train.stages import read_stages
@@ -56,7 +56,7 @@ def test_other_sums_of_levels_start_as_pytorch_does() -> None:
 
 
 def test_kassds_priors_hold_behind_llm() -> None:
-    model = kassd(KassdConfig())
+    model = kassd(KASSDConfig())
     for seed in range(4):
         torch.manual_seed(seed)
         bev = model.neck(crowded_map(256, seed))
@@ -75,5 +75,5 @@ def test_kam_learns_the_overlap_at_which_it_is_scored(name: str) -> None:
     config = build(recipe.detector.name, recipe.detector.options).config
     official = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
     scored = [recipe.validation.iou.get(of_class, official[of_class]) for of_class in config.classes]
-    taught = config.kam_options.positive_iou
+    taught = config.kam_options.fg_iou
     assert [*(taught * len(scored))[: len(scored)]] == scored

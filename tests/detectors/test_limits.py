@@ -14,7 +14,7 @@ from torch import nn
 resource = pytest.importorskip("resource")
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import CATALOGUE, build, config_to_dict
+from beambox.detectors.catalog import CATALOG, build, config_to_dict
 from beambox.detectors.limits import ABOVE_ZERO, MAY_BE_NEGATIVE, MAY_BE_ZERO, bounded
 from beambox.detectors.weights import load_weights, save_weights
 
@@ -37,9 +37,9 @@ def changed(values: Any, place: tuple[Any, ...], value: Any) -> Any:
     return copy
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", CATALOG)
 def test_every_number_of_every_configuration_is_bounded(name: str) -> None:
-    options = config_to_dict(CATALOGUE[name].config())
+    options = config_to_dict(CATALOG[name].config())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for place, value in leaves(options):
         for wrong in (10**9, 10**18, -1) if isinstance(value, int) else (1e300, float("nan"), float("inf")):
@@ -51,7 +51,7 @@ def test_every_number_of_every_configuration_is_bounded(name: str) -> None:
 def test_the_names_of_exceptions_are_those_of_fields() -> None:
     fields = {
         next(key for key in reversed(place) if isinstance(key, str))
-        for entry in CATALOGUE.values()
+        for entry in CATALOG.values()
         for place, _ in leaves(config_to_dict(entry.config()))
     }
     assert fields >= MAY_BE_ZERO | MAY_BE_NEGATIVE | ABOVE_ZERO

@@ -12,9 +12,9 @@ import pytest
 import torch
 
 import beambox
-from beambox.detectors.catalogue import CATALOGUE
+from beambox.detectors.catalog import CATALOG
 from beambox.structures import Batch
-from oracles.small_detectors import CAR, car_frame, made
+from oracles.small_detectors import CAR, build_small, car_frame
 
 PACKAGE = Path(beambox.__file__).parent
 SHARED = ("layers", "ops", "geometry", "structures")
@@ -39,9 +39,9 @@ def files_executed(call: Any) -> set[str]:
     return {str(path) for path in ours if path.parts[0] not in SHARED and path.name != "checks.py"}
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", CATALOG)
 def test_one_forward_runs_at_most_two_files_beyond_the_shared_layers(name: str) -> None:
-    model = made(name).eval()
+    model = build_small(name).eval()
     batch = Batch.of([car_frame(1, CAR)])
     with torch.inference_mode():
         files = files_executed(lambda: model(batch))

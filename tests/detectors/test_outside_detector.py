@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import CATALOGUE, build
+from beambox.detectors.catalog import CATALOG, build
 from beambox.detectors.weights import load_weights, save_weights
 
 MODULE = """
 from dataclasses import dataclass
 from torch import nn
-from beambox.detectors.catalogue import CatalogueEntry
+from beambox.detectors.catalog import CatalogEntry
 
 @dataclass(frozen=True)
 class ToyConfig:
@@ -27,7 +27,7 @@ class Toy(nn.Module):
         self.config = config
         self.layer = nn.Linear(config.width, 1)
 
-ENTRY = CatalogueEntry(ToyConfig, Toy)
+ENTRY = CatalogEntry(ToyConfig, Toy)
 """
 
 
@@ -42,16 +42,16 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(metadata, "_cache", None, raising=False)
     yield
-    CATALOGUE.pop("toy", None)
+    CATALOG.pop("toy", None)
     sys.modules.pop("toy_package", None)
 
 
 def test_a_detector_from_outside_is_built_saved_and_loaded(package: None, tmp_path: Path) -> None:
-    assert "toy" not in CATALOGUE
+    assert "toy" not in CATALOG
     model = build("toy", {"width": 3})
     assert model.layer.in_features == 3
     save_weights(tmp_path / "toy.safetensors", model)
-    CATALOGUE.pop("toy")  # another process has not asked for it yet
+    CATALOG.pop("toy")  # another process has not asked for it yet
     assert load_weights(tmp_path / "toy.safetensors").config.width == 3
 
 
@@ -60,5 +60,5 @@ def test_its_errors_are_ours(package: None) -> None:
         build("toy", {"widht": 3})
     with pytest.raises(BeamboxError, match=r'no detector is called "toi" \(did you mean "toy"\?\)'):
         build("toi")
-    with pytest.raises(BeamboxError, match=r'"broken".*toy_package:Toy.* must be a .*CatalogueEntry, got type'):
+    with pytest.raises(BeamboxError, match=r'"broken".*toy_package:Toy.* must be a .*CatalogEntry, got type'):
         build("broken")

@@ -10,7 +10,7 @@ from torch import nn
 
 from beambox.data.kitti import KittiSource
 from beambox.detectors.second import KITTI_CAR, second
-from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
+from beambox.detectors.voxel_rcnn import VoxelRCNNConfig, voxel_rcnn
 from beambox.geometry.grid import VoxelGrid
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.ops.rotated_iou import iou_3d
@@ -75,5 +75,5 @@ def test_second_learns_one_sweep_by_heart():
 
 def test_voxel_rcnn_learns_one_sweep_by_heart():
     torch.manual_seed(0)
-    config = replace(VoxelRcnnConfig(), grid=REGION, depths=(2, 2))
+    config = replace(VoxelRCNNConfig(), grid=REGION, depths=(2, 2))
     learn_by_heart(voxel_rcnn(config))

@@ -4,7 +4,7 @@ import torch
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
 from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.structures import Batch
-from oracles.small_detectors import POINTPILLARS, car_frame, made
+from oracles.small_detectors import POINTPILLARS, build_small, car_frame
 
 
 def test_published_network_has_the_published_size() -> None:
@@ -14,7 +14,7 @@ def test_published_network_has_the_published_size() -> None:
 
 
 def test_a_window_agrees_with_the_whole_far_from_its_border() -> None:
-    model = made("pointpillars").eval()
+    model = build_small("pointpillars").eval()
     batch = Batch.of([car_frame(2, [10, 0, -1, 4.0, 1.7, 1.5, 0.0], ground=1500, reach=20.0)])
     whole = model(batch).cls.reshape(1, 32, 32, -1)
     window = POINTPILLARS.grid.window((0, 0), (64, 48))

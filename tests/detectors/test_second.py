@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from beambox.checks import BeamboxError
-from beambox.detectors.second import KITTI_CAR, ONCE, SecondConfig, second
+from beambox.detectors.second import KITTI_CAR, ONCE, SECONDConfig, second
 
 
 def test_parameters_of_the_published_network():
@@ -14,8 +14,8 @@ def test_parameters_of_the_published_network():
 
 
 def test_classes_of_the_configurations():
-    assert SecondConfig().classes == ("Car", "Pedestrian", "Cyclist")
+    assert SECONDConfig().classes == ("Car", "Pedestrian", "Cyclist")
     assert KITTI_CAR.classes == ("Car",)
     assert ONCE.classes == ("Car", "Bus", "Truck", "Pedestrian", "Cyclist")
     with pytest.raises(BeamboxError, match="at least one class"):
-        SecondConfig(anchors=())
+        SECONDConfig(anchors=())

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.detectors.voxel_rcnn import KITTI, ONCE, VoxelRcnnConfig, voxel_rcnn
+from beambox.detectors.voxel_rcnn import KITTI, ONCE, VoxelRCNNConfig, voxel_rcnn
 from beambox.structures import Batch
-from oracles.small_detectors import CAR, TWO_STAGES, car_frame, made
+from oracles.small_detectors import CAR, TWO_STAGES, build_small, car_frame
 
 
 def test_parameters_of_the_published_network():
@@ -16,15 +16,15 @@ def test_parameters_of_the_published_network():
 
 
 def test_classes_of_the_configurations():
-    assert VoxelRcnnConfig().classes == ("Car",)
+    assert VoxelRCNNConfig().classes == ("Car",)
     assert KITTI.classes == ("Car", "Pedestrian", "Cyclist")
     assert ONCE.classes == ("Car", "Bus", "Truck", "Pedestrian", "Cyclist")
     with pytest.raises(BeamboxError, match="levels of stride 2, 4 or 8"):
-        VoxelRcnnConfig(pooling=())
+        VoxelRCNNConfig(pooling=())
 
 
 def test_evaluation_refines_every_proposal():
-    small = made("voxel_rcnn")
+    small = build_small("voxel_rcnn")
     batch = Batch.of([car_frame(1, CAR), car_frame(2)])
     small.eval()
     with torch.inference_mode():
@@ -32,7 +32,7 @@ def test_evaluation_refines_every_proposal():
         assert len(predictions.refined.cls) == len(predictions.rois.boxes) <= 20
         detections = small.decode(predictions)
         to_learn = small(batch, labels=batch.labels)
-        assert len(to_learn.refined.cls) == 2 * TWO_STAGES["sampling"].per_sample, "those drawn to learn from"
+        assert len(to_learn.refined.cls) == 2 * TWO_STAGES["sampling"].rois_per_frame, "those drawn to learn from"
         assert set(small.loss(to_learn, batch.labels)) >= {"cls", "roi_cls"}
     assert len(detections) == 2
     assert all(d.classes == ("Car",) for d in detections)

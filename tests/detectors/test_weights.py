@@ -7,9 +7,9 @@ import torch
 from safetensors.torch import save_file
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import build, config_from_dict, config_to_dict
+from beambox.detectors.catalog import build, config_from_dict, config_to_dict
 from beambox.detectors.pointpillars import PointPillarsConfig
-from beambox.detectors.voxel_rcnn import VoxelRcnnConfig
+from beambox.detectors.voxel_rcnn import VoxelRCNNConfig
 from beambox.detectors.weights import fill, load_weights, read_weights, save_weights
 
 OPTIONS = {"widths": [8, 8, 8], "up_widths": [8, 8, 8], "voxel_channels": 8, "depths": [0, 0, 0]}
@@ -86,15 +86,15 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path: Path, monkeypatch: pyte
 
 
 def test_configurations_survive_plain_values() -> None:
-    config = PointPillarsConfig(widths=(1, 2, 3), centred_anchors=True)
+    config = PointPillarsConfig(widths=(1, 2, 3), centered_anchors=True)
     assert config_from_dict(PointPillarsConfig, config_to_dict(config)) == config
 
 
 def test_settings_given_in_part_keep_the_defaults_of_the_detector() -> None:
-    config = config_from_dict(VoxelRcnnConfig, {"post": {"score_threshold": 0.2}, "sampling": {"per_sample": 8}})
-    assert config.post == replace(VoxelRcnnConfig().post, score_threshold=0.2)  # of its kind alone: overlap up to 0.01
+    config = config_from_dict(VoxelRCNNConfig, {"post": {"score_threshold": 0.2}, "sampling": {"rois_per_frame": 8}})
+    assert config.post == replace(VoxelRCNNConfig().post, score_threshold=0.2)  # of its kind alone: overlap up to 0.01
     assert config.post.nms_iou == 0.1
-    assert config.sampling == replace(VoxelRcnnConfig().sampling, per_sample=8)
+    assert config.sampling == replace(VoxelRCNNConfig().sampling, rois_per_frame=8)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import CATALOGUE
+from beambox.detectors.catalog import CATALOG
 from beambox.detectors.dennet import NeighborhoodAttention
 from beambox.detectors.kassd import KamOptions
 from beambox.detectors.weights import save_weights
@@ -37,7 +37,7 @@ EVERYTHING: dict[str, Any] = {"kam_options": KamOptions(threshold=0.0), "post": 
 
 def detector(name: str, **changes: Any) -> Detector:
     torch.manual_seed(1)
-    return Detector(CATALOGUE[name].build(replace(SMALL[name], **changes)), device="cpu", precision="float32")
+    return Detector(CATALOG[name].build(replace(SMALL[name], **changes)), device="cpu", precision="float32")
 
 
 @pytest.mark.parametrize(
@@ -51,12 +51,12 @@ def detector(name: str, **changes: Any) -> Detector:
     ],
 )
 def test_each_detector_shows_its_own_modules(name: str, changes: dict[str, Any], wanted: list[str]) -> None:
-    made = explain(detector(name, **changes), FRAME, min_score=0.0)
+    explained = explain(detector(name, **changes), FRAME, score_threshold=0.0)
     optional = {"neighborhood_1", "neighborhood_2"}  # of detections, which random weights may lack
-    names = [each.name for each in made]
+    names = [each.name for each in explained]
     assert [each for each in wanted if each not in optional] == [each for each in names if each not in optional]
     assert set(names) <= set(wanted)
-    for each in made:
+    for each in explained:
         assert min(each.picture.size) > 200 and np.asarray(each.picture).std() > 5
 
 
@@ -116,7 +116,7 @@ def test_the_largest_value_of_a_cell_is_drawn_and_empty_cells_stay_empty() -> No
 
 def test_the_command_writes_pictures(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     torch.manual_seed(1)
-    save_weights(tmp_path / "h.safetensors", CATALOGUE["hcnet"].build(SMALL["hcnet"]), {})
+    save_weights(tmp_path / "h.safetensors", CATALOG["hcnet"].build(SMALL["hcnet"]), {})
     FRAME.points.numpy().tofile(tmp_path / "scan.bin")
     ran = beambox(capsys, "explain", tmp_path / "h.safetensors", tmp_path / "scan.bin", "--out", tmp_path / "out")
     assert ran.status == 0, ran.err

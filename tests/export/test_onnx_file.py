@@ -18,7 +18,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import CATALOGUE, config_from_dict
+from beambox.detectors.catalog import CATALOG, config_from_dict
 from beambox.detectors.weights import save_weights
 from beambox.export import onnx_file
 from beambox.export.onnx_check import (
@@ -35,7 +35,7 @@ from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
 from oracles.command_line import beambox
 from oracles.paths import ROOT
-from oracles.small_detectors import HCNET, POINTPILLARS, SMALL, car_frame, made
+from oracles.small_detectors import HCNET, POINTPILLARS, SMALL, build_small, car_frame
 from oracles.tiny_detector import street, tiny_model
 
 ELSEWHERE = VoxelGrid((-10.24, -5.12, -3), (10.24, 5.12, 1), (0.32, 0.32, 4))
@@ -51,10 +51,10 @@ def shaken(model: Any, seed: int = 0) -> Any:
     generator = torch.Generator().manual_seed(seed)
     for layer in model.modules():
         if isinstance(layer, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
-            for held in (layer.weight.data, layer.running_var):
-                held.copy_(0.5 + torch.rand(held.shape, generator=generator))
-            for held in (layer.bias.data, layer.running_mean):
-                held.copy_(0.2 * torch.randn(held.shape, generator=generator))
+            for values in (layer.weight.data, layer.running_var):
+                values.copy_(0.5 + torch.rand(values.shape, generator=generator))
+            for values in (layer.bias.data, layer.running_mean):
+                values.copy_(0.2 * torch.randn(values.shape, generator=generator))
     for layer in (model.head.cls, model.head.box, model.head.direction):
         layer.weight.data.copy_(0.1 * torch.randn(layer.weight.shape, generator=generator))
         layer.bias.data.zero_()
@@ -66,7 +66,7 @@ class Exported:
 
     def __init__(self, folder: Path, case: str) -> None:
         self.name, self.config, self.grid, self.opset = CASES[case]
-        self.model = shaken(made(self.name, self.config))
+        self.model = shaken(build_small(self.name, self.config))
         self.path = folder / "small.onnx"
         card = {"name": "small"}
         self.written = export_onnx(self.model, self.path, grid=self.grid, opset=self.opset, card=card)
@@ -137,7 +137,7 @@ def test_a_sweep_with_cars(exported: Exported) -> None:
 
 
 def test_weights_of_another_network_do_not_agree(exported: Exported) -> None:
-    other = shaken(made(exported.name, exported.config, seed=1), seed=1)
+    other = shaken(build_small(exported.name, exported.config, seed=1), seed=1)
     found = verify(exported.path, other, synthetic_sweep(exported.config.grid))
     assert not found.agree and found.scores > 0.01 and found.boxes > 0.01
 
@@ -179,7 +179,7 @@ def test_metadata_hold_the_configuration(exported: Exported) -> None:
     assert VoxelGrid(**{key: tuple(value) for key, value in about["grid"].items()}) == (
         exported.grid or exported.config.grid
     )
-    assert config_from_dict(CATALOGUE[about["detector"]].config, about["config"]) == exported.config
+    assert config_from_dict(CATALOG[about["detector"]].config, about["config"]) == exported.config
     assert about["detector"] == exported.name and about["classes"] == ["Car"] and about["card"] == {"name": "small"}
     assert about["cells"] == list((exported.grid or exported.config.grid).size)
     assert about["post"] == {"score_threshold": 0.1, "nms_iou": 0.01, "nms_pre": 4096, "nms_post": 500}
@@ -187,7 +187,7 @@ def test_metadata_hold_the_configuration(exported: Exported) -> None:
 
 
 def test_the_model_is_not_changed(no_tracing: Exported, tmp_path: Path) -> None:
-    model = made("pointpillars").train()
+    model = build_small("pointpillars").train()
     before = {name: value.clone() for name, value in model.state_dict().items()}
     with pytest.raises(BeamboxError, match="differ"):  # the graph is that of other weights
         export_onnx(model, tmp_path / "m.onnx")
@@ -209,10 +209,10 @@ def test_another_half_turn_is_excused_only_where_rounding_decides() -> None:
     assert apart[0, 6] > 3 and apart[1:, 6].max() < 1e-5
 
 
-def test_lengths_count_relative_above_a_metre() -> None:
+def test_lengths_count_relative_above_a_meter() -> None:
     wanted = torch.tensor([[70.0, 0.1, 0, 4, 2, 1, 3.1415]])
-    got = wanted + torch.tensor([0.007, 0.007, 0, 0, 0, 0, 2e-4])  # the angle crosses the border of its interval
-    apart, _ = box_differences(got, wanted, torch.tensor([[1.0, 0.0]]))
+    actual = wanted + torch.tensor([0.007, 0.007, 0, 0, 0, 0, 2e-4])  # the angle crosses the border of its interval
+    apart, _ = box_differences(actual, wanted, torch.tensor([[1.0, 0.0]]))
     torch.testing.assert_close(apart[0, [0, 1, 6]], torch.tensor([1e-4, 7e-3, 2e-4]), atol=1e-6, rtol=0)
 
 
@@ -230,7 +230,7 @@ def test_sparse_detectors_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(
         BeamboxError, match=f"^{name} cannot be exported: .*sparse conv.*pointpillars and hcnet can be$"
     ):
-        export_onnx(made(name), tmp_path / "x.onnx")
+        export_onnx(build_small(name), tmp_path / "x.onnx")
     assert not list(tmp_path.iterdir())
 
 
@@ -240,7 +240,7 @@ def test_sparse_detectors_are_refused(name: str, tmp_path: Path) -> None:
 )
 def test_wrong_names_and_versions_are_refused(tmp_path: Path, file: str, opset: int, message: str) -> None:
     with pytest.raises(BeamboxError, match=message):
-        export_onnx(made("pointpillars"), tmp_path / file, opset=opset)
+        export_onnx(build_small("pointpillars"), tmp_path / file, opset=opset)
 
 
 def test_a_sweep_outside_the_region_is_refused(pillars: Exported) -> None:
@@ -263,7 +263,7 @@ def test_files_that_are_none_of_ours_are_refused(pillars: Exported, tmp_path: Pa
 
 
 def test_another_number_of_anchors_is_told(pillars: Exported) -> None:
-    two_classes = made("pointpillars", replace(POINTPILLARS, anchors=KITTI_ANCHORS[:2])).eval()
+    two_classes = build_small("pointpillars", replace(POINTPILLARS, anchors=KITTI_ANCHORS[:2])).eval()
     with pytest.raises(BeamboxError, match="it is of another network"):
         verify(pillars.path, two_classes, synthetic_sweep(POINTPILLARS.grid))
 
@@ -296,7 +296,7 @@ def test_an_interrupted_write_leaves_nothing(
 def test_a_file_that_differs_is_not_written_and_the_old_one_stays(no_tracing: Exported, tmp_path: Path) -> None:
     (tmp_path / "m.onnx").write_text("old")
     with pytest.raises(BeamboxError, match=r"differ on built-in sweep: .*allowed are 1e-04; nothing was written"):
-        export_onnx(shaken(made("pointpillars", seed=1), seed=1), tmp_path / "m.onnx")
+        export_onnx(shaken(build_small("pointpillars", seed=1), seed=1), tmp_path / "m.onnx")
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
 
 
@@ -306,7 +306,7 @@ def test_a_file_that_differs_is_not_written_and_the_old_one_stays(no_tracing: Ex
 def test_a_missing_package_is_told_with_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_file, "find_spec", lambda name: None)
     with pytest.raises(BeamboxError, match=r'needs onnx and onnxscript: python -m pip install "\.\[export\]"'):
-        export_onnx(made("pointpillars"), tmp_path / "m.onnx")
+        export_onnx(build_small("pointpillars"), tmp_path / "m.onnx")
 
 
 def test_without_onnxruntime_the_file_is_written_unless_a_sweep_is_given(
@@ -336,13 +336,13 @@ def test_the_command_and_the_example_of_its_page(
 
     page = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     (example,) = page.split("```python\n")[1:]
-    told: dict[str, Any] = {}
-    exec(compile(example.split("```")[0], "docs/export.md", "exec"), told)
+    namespace: dict[str, Any] = {}
+    exec(compile(example.split("```")[0], "docs/export.md", "exec"), namespace)
     from beambox.infer.predictor import Detector
 
     wanted = Detector(model, precision="float32", device="cpu")("scan.bin")
-    assert len(told["keep"]) == len(wanted) > 5
-    boxes, score = (told[name][told["keep"]] for name in ("boxes", "score"))
+    assert len(namespace["keep"]) == len(wanted) > 5
+    boxes, score = (namespace[name][namespace["keep"]] for name in ("boxes", "score"))
     torch.testing.assert_close(score, wanted.scores, atol=1e-4, rtol=0)
     same = torch.cdist(wanted.boxes, boxes).argmin(dim=1)  # scores that differ in the seventh digit may change places
     assert sorted(same.tolist()) == list(range(len(boxes)))
@@ -352,7 +352,7 @@ def test_the_command_and_the_example_of_its_page(
 
 
 def test_the_command_refuses_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    save_weights(tmp_path / "second.safetensors", made("second"))
+    save_weights(tmp_path / "second.safetensors", build_small("second"))
     ran = beambox(capsys, "export", tmp_path / "second.safetensors", "--out", tmp_path / "x.onnx")
     assert ran.status == 2 and ran.err.splitlines()[-1].startswith("beambox: second cannot be exported")
     assert not (tmp_path / "x.onnx").exists()
@@ -361,7 +361,7 @@ def test_the_command_refuses_in_one_line(tmp_path: Path, capsys: pytest.CaptureF
 def test_the_command_leaves_no_file_where_the_comparison_fails(
     no_tracing: Exported, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    save_weights(tmp_path / "other.safetensors", shaken(made("pointpillars", seed=1), seed=1))
+    save_weights(tmp_path / "other.safetensors", shaken(build_small("pointpillars", seed=1), seed=1))
     ran = beambox(capsys, "export", tmp_path / "other.safetensors", "--out", tmp_path / "new" / "x.onnx")
     assert ran.status == 2 and "nothing was written" in ran.err.splitlines()[-1]
     assert not (tmp_path / "new").exists()

@@ -78,17 +78,17 @@ class Harm:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "pattern"),
     [
         (b"not a checkpoint", "cannot read"),
         (pickle.dumps({"model_state": Harm()}), "cannot read"),
         (b"", "cannot read"),
     ],
 )
-def test_unreadable_files_are_refused_and_no_code_runs(tmp_path, content, said, capsys):
+def test_unreadable_files_are_refused_and_no_code_runs(tmp_path, content, pattern, capsys):
     path = tmp_path / "c.pth"
     path.write_bytes(content)
-    with pytest.raises(BeamboxError, match=said):
+    with pytest.raises(BeamboxError, match=pattern):
         import_checkpoint(path, "second")
     assert capsys.readouterr().out == ""
 

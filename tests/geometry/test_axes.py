@@ -45,8 +45,8 @@ def test_boxes_turn_with_their_corners(text: str) -> None:
     boxes = torch.tensor([[3.0, -7, 1, 4, 2, 1.5, 0.4], [0, 1, 2, 3, 1, 1, -3.0]], dtype=torch.float64)
     turned = turn_boxes(boxes, axes.matrix)
     wanted = corners_3d(boxes) @ axes.matrix.T
-    got = corners_3d(turned)
-    assert torch.cdist(got, wanted).amin(dim=2).max() < 1e-9  # the same corners, in any order
+    actual = corners_3d(turned)
+    assert torch.cdist(actual, wanted).amin(dim=2).max() < 1e-9  # the same corners, in any order
     back = turn_boxes(turned, axes.matrix.T)
     assert torch.allclose(back[:, :6], boxes[:, :6])
     assert ((back[:, 6] - boxes[:, 6]) / (2 * math.pi)).frac().abs().max() < 1e-9

@@ -32,9 +32,9 @@ def test_border_points_are_inside_below_and_outside_above() -> None:
 
 
 @given(st.integers(0, 39), st.integers(0, 1599), st.integers(0, 1407))
-def test_the_centre_of_a_cell_lies_in_it(z: int, y: int, x: int) -> None:
+def test_the_center_of_a_cell_lies_in_it(z: int, y: int, x: int) -> None:
     cell = torch.tensor([[z, y, x]])
-    index, inside = KITTI.index(KITTI.centre(cell))
+    index, inside = KITTI.index(KITTI.center(cell))
     assert bool(inside) and torch.equal(index, cell)
 
 

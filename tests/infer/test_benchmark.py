@@ -40,7 +40,7 @@ def test_json_says_what_was_measured_on_what(report: Report) -> None:
     content = json.loads(json.dumps(report.to_json()))
     assert set(content["stages"]) == set(STAGES)
     assert set(content["total"]) == {"mean", "median", "p90", "p99", "min"}
-    told = {key: content[key] for key in ("model", "precision", "batch", "points", "warmup", "runs", "unit")}
+    output = {key: content[key] for key in ("model", "precision", "batch", "points", "warmup", "runs", "unit")}
     expected = {
         "model": "tiny",
         "precision": "float32",
@@ -50,7 +50,7 @@ def test_json_says_what_was_measured_on_what(report: Report) -> None:
         "runs": 4,
         "unit": "ms",
     }
-    assert told == expected
+    assert output == expected
     assert content["torch"] == torch.__version__ and content["device"] and content["peak_memory_mb"] > 10
 
 
@@ -104,8 +104,8 @@ def test_a_detector_is_timed_as_configured_without_trained_weights(
     assert (first.model.config.width, first.model.config.kam) == (8, True)
     assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), again.model.parameters()))
     words = ("--config", "--protocol", "kassd", "--device", "cpu", "--warmup", 0)
-    told = beambox(capsys, "bench", recipe, *words).out
-    assert "untrained weights" in told and "42.9" in told
+    output = beambox(capsys, "bench", recipe, *words).out
+    assert "untrained weights" in output and "42.9" in output
     for name, message in (("kasd", r'did you mean "kassd"'), (tmp_path / "no.yaml", "there is no recipe")):
         with pytest.raises(BeamboxError, match=message):
             untrained(name)

@@ -12,17 +12,18 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.detectors.pointpillars import KITTI_PILLARS
 from beambox.geometry.axes import Axes
-from beambox.infer.doctor import Diagnosis, examine
-from beambox.infer.trained import Trained
+from beambox.infer import doctor
+from beambox.infer.doctor import Diagnosis
+from beambox.infer.sensor_profile import SensorProfile
 from oracles.paths import data_dir
 from oracles.tiny_detector import street
 
-TRAINED = Trained(KITTI_PILLARS, points=6000)
+TRAINED = SensorProfile(KITTI_PILLARS, points=6000)
 
 
 def diagnose(points: np.ndarray, folder: Path) -> Diagnosis:
     points.astype(np.float32).tofile(folder / "scan.bin")
-    return examine(folder / "scan.bin", TRAINED)
+    return doctor.diagnose(folder / "scan.bin", TRAINED)
 
 
 def turned(points: np.ndarray, axes: str) -> np.ndarray:
@@ -44,7 +45,7 @@ def test_another_height_is_measured(tmp_path: Path, height: float) -> None:
     diagnosis = diagnose(street(height=height), tmp_path)
     assert diagnosis.options[0] == "--sensor-height"
     assert float(diagnosis.options[1]) == pytest.approx(height, abs=0.05)
-    assert diagnosis.corrections.raise_by == pytest.approx(height - 1.73, abs=0.05)
+    assert diagnosis.alignment.z_offset == pytest.approx(height - 1.73, abs=0.05)
 
 
 def test_a_ground_that_leans_is_a_note_with_the_option(tmp_path: Path) -> None:
@@ -106,7 +107,7 @@ def test_an_empty_sweep_is_told_and_a_broken_one_refused(tmp_path: Path) -> None
     assert [f.text for f in diagnose(np.zeros((0, 4)), tmp_path).findings] == ["the sweep has no points"]
     (tmp_path / "cut.bin").write_bytes(bytes(range(9)))
     with pytest.raises(BeamboxError, match="cut short"):
-        examine(tmp_path / "cut.bin", TRAINED)
+        doctor.diagnose(tmp_path / "cut.bin", TRAINED)
 
 
 def test_dropped_points_and_points_behind_are_told(tmp_path: Path) -> None:
@@ -122,19 +123,19 @@ def test_a_few_points_do_not_break_it(tmp_path: Path) -> None:
 
 
 def test_the_card_says_what_training_was_like() -> None:
-    trained = Trained.of({"sensor height": 2.1, "intensity_mean": 0.4, "licence": "CC0"}, KITTI_PILLARS)
-    assert (trained.sensor_height, trained.intensity_mean, trained.points) == (2.1, 0.4, 18_000)
+    sensor_profile = SensorProfile.of({"sensor height": 2.1, "intensity_mean": 0.4, "licence": "CC0"}, KITTI_PILLARS)
+    assert (sensor_profile.sensor_height, sensor_profile.intensity_mean, sensor_profile.points) == (2.1, 0.4, 18_000)
 
 
 def test_real_sweeps_are_healthy_and_their_copies_with_other_axes_are_not(tmp_path: Path) -> None:
     for path in sorted(data_dir("kitti", "training", "velodyne").glob("*.bin"))[:12:3]:
-        assert examine(path, Trained(KITTI_PILLARS)).options == (), path.name
+        assert diagnose(path, SensorProfile(KITTI_PILLARS)).options == (), path.name
         points = np.fromfile(path, dtype=np.float32).reshape(-1, 4)
         camera = turned(points, "x: right, y: down, z: forward")
         assert diagnose(camera, tmp_path).options == ("--axes", "x: right, y: down, z: forward"), path.name
 
 
 def test_a_real_sweep_with_its_origin_on_the_ground_gets_a_height() -> None:
-    options = examine(data_dir("pandaset_002", "velodyne", "00.bin"), Trained(KITTI_PILLARS)).options
+    options = diagnose(data_dir("pandaset_002", "velodyne", "00.bin"), SensorProfile(KITTI_PILLARS)).options
     assert options[0] == "--sensor-height" and abs(float(options[1])) < 0.5
     assert torch.tensor(float(options[3])) > 1, "its intensity is much darker than KITTI's"

@@ -40,7 +40,7 @@ def test_perfect_detections_score_full_without_a_camera() -> None:
     assert lost["Car"].box3d[0].all_points == pytest.approx(60)
 
 
-def test_unlabelled_frames_and_missing_cameras_are_refused(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_unlabeled_frames_and_missing_cameras_are_refused(tmp_path) -> None:  # type: ignore[no-untyped-def]
     bare = FrameList([replace(frames(1).frames[0], labels=None)])
     none = [Detections.empty(("Car",))]
     with pytest.raises(BeamboxError, match="has no labels, so detections cannot be scored"):

@@ -14,7 +14,18 @@ from beambox.infer.ground import EmptyGround
 from beambox.infer.predictor import Detector
 from beambox.ops.map_conv import GroundedConv
 from beambox.structures import Batch, Frame
-from oracles.small_detectors import CAR, DENNET, HCNET, KASSD, POINTPILLARS, SECOND, VOXEL_RCNN, car_frame, made, said
+from oracles.small_detectors import (
+    CAR,
+    DENNET,
+    HCNET,
+    KASSD_CONFIG,
+    POINTPILLARS,
+    SECOND,
+    VOXEL_RCNN,
+    build_small,
+    car_frame,
+    output_tensors,
+)
 
 TWO: dict[str, Any] = {"widths": (16, 32), "up_widths": (16, 16)}
 THREE: dict[str, Any] = {"voxel_channels": 16, "widths": (16, 16, 32), "up_widths": (16, 16, 32)}
@@ -25,13 +36,13 @@ WIDE: dict[str, Any] = {  # at least as wide as a vector
     "second": replace(SECOND, **TWO),
     "voxel_rcnn": replace(VOXEL_RCNN, **TWO),
     "dennet": replace(DENNET, **TWO),
-    "kassd": replace(KASSD, width=16, kam_width=16),
-    "kassd: PSA": replace(KASSD, width=16, kam_width=16, neck=Neck.PSA),
+    "kassd": replace(KASSD_CONFIG, width=16, kam_width=16),
+    "kassd: PSA": replace(KASSD_CONFIG, width=16, kam_width=16, neck=Neck.PSA),
 }
 
 
 def detector(name: str, seed: int = 0) -> Detector:
-    model = made(name.partition(":")[0], WIDE[name], seed)
+    model = build_small(name.partition(":")[0], WIDE[name], seed)
     torch.manual_seed(seed)
     for layer in model.modules():
         if isinstance(layer, torch.nn.BatchNorm2d):
@@ -46,7 +57,7 @@ class NeverLearns(EmptyGround):
 
 
 def answers(found: Detector, *frames: Frame) -> list[torch.Tensor]:
-    return said(found.predict(Batch.of(list(frames))))
+    return output_tensors(found.predict(Batch.of(list(frames))))
 
 
 @pytest.fixture

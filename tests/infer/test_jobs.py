@@ -159,8 +159,8 @@ def run_and_kill(tmp_path: Path, weights: Path, count: int, kills: int) -> None:
     for kill in range(kills + 1):
         process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True)
         if kill == kills:
-            _, told = process.communicate(timeout=600)
-            assert process.returncode == 0, told
+            _, output = process.communicate(timeout=600)
+            assert process.returncode == 0, output
             break
         before = len(done_in(tmp_path / "out"))
         while process.poll() is None and len(done_in(tmp_path / "out")) < min(

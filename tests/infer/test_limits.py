@@ -10,12 +10,12 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.cli.detect import unseen
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.detectors.pointpillars import KITTI_PILLARS
 from beambox.geometry import VoxelGrid
-from beambox.infer.doctor import examine
+from beambox.infer.doctor import diagnose
 from beambox.infer.predictor import Detector, region
-from beambox.infer.trained import Trained
+from beambox.infer.sensor_profile import SensorProfile
 from beambox.simulate.sensors import load_sensor
 from beambox.structures import Frame
 from oracles.own_data import scene
@@ -51,7 +51,7 @@ def test_doctor_stops_at_units(tmp_path: Path) -> None:
     """A cloud in millimetres got the advice --range 15070, which asked for 726 GB."""
     points = scene(0)[0] * np.array([1000, 1000, 1000, 1])
     points.astype("<f4").tofile(tmp_path / "mm.bin")
-    diagnosis = examine(tmp_path / "mm.bin", Trained(KITTI_PILLARS))
+    diagnosis = diagnose(tmp_path / "mm.bin", SensorProfile(KITTI_PILLARS))
     assert diagnosis.options == () and "divide them by 1000" in diagnosis.findings[-1].text
 
 
@@ -64,6 +64,6 @@ def test_detect_says_what_it_does_not_look_at() -> None:
     detector = Detector(build("pointpillars", options), device="cpu", precision="float32")
     turn = torch.linspace(0, 6.28, 1000)
     points = torch.stack((10 * turn.cos(), 6 * turn.sin(), torch.zeros(1000), torch.zeros(1000)), dim=1)
-    told = unseen(detector, Frame(points))
-    assert told.startswith("50% of the points lie where the network does not look") and "--range 50" in told
+    output = unseen(detector, Frame(points))
+    assert output.startswith("50% of the points lie where the network does not look") and "--range 50" in output
     assert unseen(detector, Frame(points[points[:, 0] > 0])) == ""

@@ -14,7 +14,8 @@ import beambox
 from beambox import BeamboxError, Detections, Frame, VoxelGrid
 from beambox.detectors.pointpillars import PointPillars
 from beambox.detectors.weights import save_weights
-from beambox.infer.predictor import Detector, find_weights, load, region
+from beambox.infer.predictor import Detector, load, region
+from beambox.zoo import find_weights
 from oracles.tiny_detector import GRID, kitti_folder, street, tiny_model, tiny_weights
 
 
@@ -114,7 +115,7 @@ def test_sensor_height_finds_the_same_at_another_height(weights: Path, detector:
 
 
 def test_sensor_height_is_relative_to_what_the_card_says(tmp_path: Path) -> None:
-    assert load(tiny_weights(tmp_path, sensor_height=2.0), sensor_height=2.5).corrections.raise_by == pytest.approx(0.5)
+    assert load(tiny_weights(tmp_path, sensor_height=2.0), sensor_height=2.5).alignment.z_offset == pytest.approx(0.5)
 
 
 def test_axes_find_the_same_in_another_frame(weights: Path, detector: Detector) -> None:
@@ -218,7 +219,7 @@ def test_a_gpu_that_is_not_there_is_said(weights: Path) -> None:
 
 
 def test_unknown_weights_name_the_nearest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("beambox.infer.predictor.shipped", lambda: {"pointpillars-sim": tmp_path / "p.safetensors"})
+    monkeypatch.setattr("beambox.zoo.shipped", lambda: {"pointpillars-sim": tmp_path / "p.safetensors"})
     with pytest.raises(BeamboxError, match=r'no weights are called "pointpilars-sim".*did you mean "pointpillars-sim"'):
         find_weights("pointpilars-sim")
     assert find_weights("pointpillars-sim") == tmp_path / "p.safetensors"

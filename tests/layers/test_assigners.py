@@ -30,28 +30,28 @@ def test_assign_agrees_with_plain_loops(seed: int, count: int) -> None:
         members = (classes == k).nonzero()[:, 0]
         own = anchors.reshape(-1, 3, 2, 7)[:, k].reshape(-1, 7)
         label = found.label.reshape(-1, 3, 2)[:, k].reshape(-1)
-        matched = found.matched.reshape(-1, 3, 2)[:, k].reshape(-1)
+        gt_index = found.gt_index.reshape(-1, 3, 2)[:, k].reshape(-1)
         if len(members) == 0:
             assert (label == 0).all()
             continue
         wanted, chosen = assign_one_class(
-            own.double().tolist(), boxes[members].double().tolist(), kind.matched, kind.unmatched
+            own.double().tolist(), boxes[members].double().tolist(), kind.matched_threshold, kind.unmatched_threshold
         )
         wanted_label = torch.tensor([k + 1 if w > 0 else w for w in wanted])
         assert (label != wanted_label).sum() <= 1  # float32 against float64 on a threshold
         positive = (label > 0) & (wanted_label > 0)
-        assert (matched[positive] == members[torch.tensor(chosen)[positive]]).all()
+        assert (gt_index[positive] == members[torch.tensor(chosen)[positive]]).all()
 
 
 def test_every_object_inside_gets_an_anchor() -> None:
-    grid = AnchorGrid(KITTI_ANCHORS[:1], REGION, stride=2, centred=True)
+    grid = AnchorGrid(KITTI_ANCHORS[:1], REGION, stride=2, centered=True)
     boxes = random_boxes(5, 3)
     found = assign(grid, REGION, grid.boxes(REGION), boxes, torch.zeros(5, dtype=torch.int64))
     assert found.positive.sum() >= 5
 
 
-def test_objects_centred_outside_are_neither_target_nor_background() -> None:
-    grid = AnchorGrid((AnchorClass("Car", (4.0, 2.0, 1.5), -1.7, 0.6, 0.45),), REGION, stride=2, centred=True)
+def test_objects_centered_outside_are_neither_target_nor_background() -> None:
+    grid = AnchorGrid((AnchorClass("Car", (4.0, 2.0, 1.5), -1.7, 0.6, 0.45),), REGION, stride=2, centered=True)
     outside = torch.tensor([[16.1, 0.5, -1, 4.0, 2.0, 1.5, 0.0]])
     found = assign(grid, REGION, grid.boxes(REGION), outside, torch.zeros(1, dtype=torch.int64))
     assert not found.positive.any()
@@ -72,16 +72,16 @@ def test_positions_spread_over_the_borders_as_in_the_toolbox() -> None:
     assert float(boxes[0, 0, 0, 2]) == pytest.approx(-1.0)
 
 
-@pytest.mark.parametrize("centred", [True, False])
-def test_a_window_has_the_anchors_of_its_place(centred: bool) -> None:
-    grid = AnchorGrid(KITTI_ANCHORS, REGION, stride=2, centred=centred)
+@pytest.mark.parametrize("centered", [True, False])
+def test_a_window_has_the_anchors_of_its_place(centered: bool) -> None:
+    grid = AnchorGrid(KITTI_ANCHORS, REGION, stride=2, centered=centered)
     whole = grid.boxes(REGION).reshape(16, 16, -1)
     part = grid.boxes(REGION.window((8, 4), (12, 20))).reshape(10, 6, -1)
     torch.testing.assert_close(part, whole[2:12, 4:10])
 
 
 def test_nearest_rectangles_swap_at_45_degrees() -> None:
-    grid = AnchorGrid(KITTI_ANCHORS[:1], REGION, stride=2, centred=True)
+    grid = AnchorGrid(KITTI_ANCHORS[:1], REGION, stride=2, centered=True)
     along = torch.tensor([[8.5, 0.5, -1, 3.9, 1.6, 1.5, math.radians(44)]])
     across = torch.tensor([[8.5, 0.5, -1, 3.9, 1.6, 1.5, math.radians(46)]])
     zero = torch.zeros(1, dtype=torch.int64)

@@ -19,9 +19,9 @@ def padded(network: PillarFeatures, voxels, slots: int) -> torch.Tensor:
     for v in range(len(voxels.index)):
         points = voxels.points[voxels.voxel == v]
         z, y, x = voxels.index[v, 1:].tolist()
-        centre = torch.tensor([x + 0.5, y + 0.5, z * 4 - 1.0])
+        center = torch.tensor([x + 0.5, y + 0.5, z * 4 - 1.0])
         rows = torch.zeros(slots, 10)
-        rows[: len(points)] = torch.cat((points, points[:, :3] - points[:, :3].mean(0), points[:, :3] - centre), dim=1)
+        rows[: len(points)] = torch.cat((points, points[:, :3] - points[:, :3].mean(0), points[:, :3] - center), dim=1)
         out.append(torch.relu(network.norm(network.linear(rows))).amax(dim=0))
     return torch.stack(out)
 

@@ -61,7 +61,7 @@ def test_sampling_fills_up_from_what_there_is(offsets, positive, hard):
 
 def test_regions_answer_for_objects_of_their_own_class():
     rois = rois_near(CAR, [0.0, 0.0], labels=[0, 1])
-    targets = sample_rois(rois, [CAR[None]], [torch.tensor([1])], RoiSampling(per_sample=20), generator())
+    targets = sample_rois(rois, [CAR[None]], [torch.tensor([1])], RoiSampling(rois_per_frame=20), generator())
     assert targets.iou[targets.rois.labels == 0].eq(0).all()
     assert targets.iou[targets.rois.labels == 1].gt(0.99).all()
 
@@ -89,12 +89,12 @@ def test_score_rises_linearly_between_the_thresholds():
 
 
 angle = st.floats(-math.pi, math.pi)
-metre = st.floats(-3, 3)
+meter = st.floats(-3, 3)
 size = st.floats(0.5, 5)
 
 
 @settings(deadline=None)
-@given(metre, metre, metre, size, size, size, angle, angle)
+@given(meter, meter, meter, size, size, size, angle, angle)
 def test_decoding_undoes_the_canonical_targets(x, y, z, length, w, h, yaw, roi_yaw):
     roi = torch.tensor([[8.0, -3.0, -1.0, 4.2, 1.7, 1.4, roi_yaw]], dtype=torch.float64)
     box = torch.tensor([[8.0 + x, -3.0 + y, -1.0 + z, length, w, h, yaw]], dtype=torch.float64)

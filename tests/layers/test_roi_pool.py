@@ -25,7 +25,7 @@ ROIS = Rois(
 @pytest.fixture
 def pool():
     torch.manual_seed(0)
-    pool = VoxelRoiPool([5], [PoolLevel(2, (2, 2, 2), 0.9, samples=4, channels=6)], lattice=3).eval()
+    pool = VoxelRoiPool([5], [PoolLevel(2, (2, 2, 2), 0.9, max_samples=4, channels=6)], grid_size=3).eval()
     for module in pool.modules():
         if isinstance(module, torch.nn.BatchNorm1d):
             torch.nn.init.uniform_(module.running_mean)
@@ -52,17 +52,17 @@ def test_pooling_equals_loops(pool):
     gather = pool.levels[0]
     out = pool(ROIS, [features], GRID).reshape(3, 27, 6)
     size = torch.tensor(GRID.cell) * 2
-    centres = (features.indices[:, 1:].flip(1) + 0.5) * size + torch.tensor(GRID.minimum)
+    centers = (features.indices[:, 1:].flip(1) + 0.5) * size + torch.tensor(GRID.minimum)
     points = pool.grid_points(ROIS.boxes)
     for r, p in [(0, 0), (0, 13), (1, 5), (1, 26), (2, 0)]:
         point = points[r, p]
         fine = torch.floor((point - torch.tensor(GRID.minimum)) / torch.tensor(GRID.cell)).long().flip(0)
         cell = torch.cat((ROIS.sample[r, None], torch.div(fine, 2, rounding_mode="floor")))
-        rows = query_by_loops(point[None], cell[None], features.sites, centres, (2, 2, 2), 0.9, 4)[0].tolist()
+        rows = query_by_loops(point[None], cell[None], features.sites, centers, (2, 2, 2), 0.9, 4)[0].tolist()
         candidates = []
         for row in rows:
             feature = gather.feature_norm(gather.feature(features.features[[row]])) if row >= 0 else torch.zeros(1, 6)
-            away = centres[row] - point if row >= 0 else torch.zeros(3)
+            away = centers[row] - point if row >= 0 else torch.zeros(3)
             candidates.append(torch.relu(feature + gather.offset_norm(gather.offset(away[None]))))
         pooled = torch.cat(candidates).amax(dim=0, keepdim=True)
         expected = torch.relu(gather.out_norm(gather.out(pooled)))[0]
@@ -78,9 +78,9 @@ def test_pool_and_head_survive_few_regions_and_no_voxels(pool, density, training
     head = RoiHead(pool.out_channels, width=8).train(training)
     predictions = head(pool(rois, [level(2, density)], GRID))
     assert predictions.cls.shape == (count,)
-    assert predictions.codes.shape == (count, 7)
-    assert predictions.codes.isfinite().all()
-    (predictions.codes.sum() + predictions.cls.sum()).backward()
+    assert predictions.deltas.shape == (count, 7)
+    assert predictions.deltas.isfinite().all()
+    (predictions.deltas.sum() + predictions.cls.sum()).backward()
 
 
 def test_gradients_reach_the_voxels(pool):

@@ -32,7 +32,7 @@ def test_folded_block_equals_convolution_norm_relu(make):
     torch.testing.assert_close(block(x).features, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_block_in_training_normalises_over_active_sites():
+def test_block_in_training_normalizes_over_active_sites():
     block = submanifold_block(3, 5).double()
     out = block(random_sparse(2)).features
     plain = block.conv(random_sparse(2)).features
@@ -69,8 +69,8 @@ def test_encoder_equals_dense_convolutions_where_everything_is_active():
     x = random_sparse(4, (28, 8, 16), 2, 1.0, 2)
 
     def dense(block, value):
-        geometry, norm = block.conv.geometry, block.norm
-        value = F.conv3d(value, dense_weight(block.conv.kernel()), None, geometry.stride, geometry.padding)
+        spec, norm = block.conv.spec, block.norm
+        value = F.conv3d(value, dense_weight(block.conv.kernel()), None, spec.stride, spec.padding)
         return F.relu(F.batch_norm(value, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps))
 
     value = x.to_dense()

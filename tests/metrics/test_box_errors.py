@@ -22,11 +22,11 @@ from oracles import nuscenes_tp
 CLASSES = ("Car", "Pedestrian")
 
 
-def frame(truth: torch.Tensor, found: torch.Tensor, scores: torch.Tensor | None = None, **labels) -> KittiFrame:
-    scores = torch.linspace(0.9, 0.5, len(found)) if scores is None else scores
+def frame(gt: torch.Tensor, det: torch.Tensor, scores: torch.Tensor | None = None, **labels) -> KittiFrame:
+    scores = torch.linspace(0.9, 0.5, len(det)) if scores is None else scores
     return KittiFrame(
-        Labels(truth, ("Car",) * len(truth), **labels),
-        Detections(found, scores, torch.zeros(len(found), dtype=torch.int64), CLASSES),
+        Labels(gt, ("Car",) * len(gt), **labels),
+        Detections(det, scores, torch.zeros(len(det), dtype=torch.int64), CLASSES),
     )
 
 
@@ -40,37 +40,37 @@ def spread_out(count: int, seed: int) -> torch.Tensor:
 
 
 def test_a_constant_displacement_is_told_in_every_frame_of_reference() -> None:
-    truth = spread_out(30, 1)
-    along = truth.clone()
-    along[:, :3] = local_to_world(torch.tensor([0.3, -0.1, 0.2]).expand(30, 1, 3), truth)[:, 0]
+    gt = spread_out(30, 1)
+    along = gt.clone()
+    along[:, :3] = local_to_world(torch.tensor([0.3, -0.1, 0.2]).expand(30, 1, 3), gt)[:, 0]
     along[:, 3:6] += torch.tensor([-0.05, 0.04, 0.1])
     along[:, 6] += 0.1
-    overall = box_errors([frame(truth, along)], ["Car"])["Car"]["overall"]
+    overall = box_errors([frame(gt, along)], ["Car"])["Car"]["overall"]
     assert (overall.matched, overall.objects) == (30, 30)
     for name, value in {"along": 0.3, "across": -0.1, "z": 0.2, "length": -0.05, "width": 0.04, "height": 0.1}.items():
         assert overall.mean[name] == pytest.approx(value, abs=1e-5), name
         assert overall.spread[name] == pytest.approx(0, abs=1e-5), name
     assert overall.mean["heading"] == pytest.approx(0.1, abs=1e-5)
     assert overall.spread["x"] > 0.1
-    away = truth.clone()
-    away[:, :2] *= 1 + 0.2 / truth[:, :2].norm(dim=1, keepdim=True)  # 0.2 m farther along each ray
+    away = gt.clone()
+    away[:, :2] *= 1 + 0.2 / gt[:, :2].norm(dim=1, keepdim=True)  # 0.2 m farther along each ray
     away[:, 0] += 0.0
-    result = box_errors([frame(truth, away)], ["Car"])["Car"]["overall"]
+    result = box_errors([frame(gt, away)], ["Car"])["Car"]["overall"]
     assert result.mean["range"] == pytest.approx(0.2, abs=1e-5)
     assert result.spread["range"] == pytest.approx(0, abs=1e-5)
-    shifted = truth + torch.tensor([0.15, -0.2, 0.04, 0, 0, 0, 0])
-    result = box_errors([frame(truth, shifted)], ["Car"])["Car"]["overall"]
+    shifted = gt + torch.tensor([0.15, -0.2, 0.04, 0, 0, 0, 0])
+    result = box_errors([frame(gt, shifted)], ["Car"])["Car"]["overall"]
     assert [result.mean[k] for k in ("x", "y", "z")] == pytest.approx([0.15, -0.2, 0.04], abs=1e-5)
 
 
 def test_mean_and_spread_by_distance_equal_numpy() -> None:
-    truth, rng = spread_out(40, 2), torch.Generator().manual_seed(0)
-    found = truth + 0.05 * torch.randn(40, 7, generator=rng)
-    found[:, 6] += math.pi * (torch.arange(40) % 4 == 0)  # a quarter points the other way
-    errors = box_errors([frame(truth[:25], found[:25]), frame(truth[25:], found[25:])], ["Car"])["Car"]
-    difference = (found - truth).double().numpy()
+    gt, rng = spread_out(40, 2), torch.Generator().manual_seed(0)
+    det = gt + 0.05 * torch.randn(40, 7, generator=rng)
+    det[:, 6] += math.pi * (torch.arange(40) % 4 == 0)  # a quarter points the other way
+    errors = box_errors([frame(gt[:25], det[:25]), frame(gt[25:], det[25:])], ["Car"])["Car"]
+    difference = (det - gt).double().numpy()
     difference[:, 6] = np.arctan(np.tan(difference[:, 6]))
-    distance = truth[:, :2].norm(dim=1).numpy()
+    distance = gt[:, :2].norm(dim=1).numpy()
     inside = {"overall": distance >= 0, "0-20m": distance < 20, "40m-inf": distance >= 40}
     inside["20-40m"] = ~inside["0-20m"] & ~inside["40m-inf"]
     assert sum(errors[name].matched for name in inside) == 80
@@ -94,24 +94,24 @@ def test_pairs_are_those_of_a_plain_search_with_polygons() -> None:
     rng = np.random.default_rng(4)
     frames, expected = [], []
     for _ in range(6):
-        truth = torch.tensor(
+        gt = torch.tensor(
             np.column_stack(
                 (rng.uniform((0, 0, -1), (12, 12, 0), (14, 3)), np.tile((4, 1.8, 1.5), (14, 1)), rng.uniform(-3, 3, 14))
             )
         ).float()
-        found = torch.cat((truth, truth)) + torch.tensor(rng.normal(0, 0.5, (28, 7)) * (1, 1, 1, 0, 0, 0, 1)).float()
+        det = torch.cat((gt, gt)) + torch.tensor(rng.normal(0, 0.5, (28, 7)) * (1, 1, 1, 0, 0, 0, 1)).float()
         scores = torch.tensor(rng.permutation(28) / 28).float()
-        frames.append(frame(truth, found, scores))
+        frames.append(frame(gt, det, scores))
         free = set(range(14))
         for j in scores.argsort(descending=True).tolist():
             overlaps = {}
             for i in free:
-                shared = area(truth[i]).intersection(area(found[j])).area
+                shared = area(gt[i]).intersection(area(det[j])).area
                 overlaps[i] = shared / (2 * 4 * 1.8 - shared)
             best = max(overlaps, key=lambda i: overlaps[i], default=None)
             if best is not None and overlaps[best] > 0.25:
                 free.remove(best)
-                expected.append(float(found[j, 2] - truth[best, 2]))
+                expected.append(float(det[j, 2] - gt[best, 2]))
     overall = box_errors(frames, ["Car"])["Car"]["overall"]
     assert overall.matched == len(expected)
     assert overall.mean["z"] == pytest.approx(np.mean(expected), abs=1e-6)
@@ -124,31 +124,31 @@ def test_nuscenes_errors_equal_plain_loops(seed: int) -> None:
     frames, truths, founds = [], [], []
     scores = iter(torch.tensor(rng.permutation(400) / 400).double().tolist())
     for number in range(5):
-        truth = spread_out(int(rng.integers(0, 9)), 10 * seed + number)
-        keep = rng.random(len(truth)) < 0.7
+        gt = spread_out(int(rng.integers(0, 9)), 10 * seed + number)
+        keep = rng.random(len(gt)) < 0.7
         near = (
-            truth[torch.tensor(keep)]
+            gt[torch.tensor(keep)]
             + torch.tensor(rng.normal(0, (0.4, 0.4, 0.1, 0.2, 0.1, 0.1, 0.8), (keep.sum(), 7))).float()
         )
-        found = torch.cat((near, near + 0.1, spread_out(int(rng.integers(0, 6)), 1000 + 10 * seed + number)))
-        own = torch.tensor([next(scores) for _ in found]).float()
-        frames.append(frame(truth, found, own))
-        truths.append([tuple(row) for row in truth.double().tolist()])
-        founds.append(list(zip(own.double().tolist(), [tuple(row) for row in found.double().tolist()])))
+        det = torch.cat((near, near + 0.1, spread_out(int(rng.integers(0, 6)), 1000 + 10 * seed + number)))
+        own = torch.tensor([next(scores) for _ in det]).float()
+        frames.append(frame(gt, det, own))
+        truths.append([tuple(row) for row in gt.double().tolist()])
+        founds.append(list(zip(own.double().tolist(), [tuple(row) for row in det.double().tolist()])))
     errors = box_errors(frames, ["Car"])["Car"]
     assert (errors.ate, errors.ase, errors.aoe) == pytest.approx(nuscenes_tp.errors(truths, founds), abs=1e-9)
     assert 0 < errors.ate < 1
 
 
 def test_nothing_found_nothing_there_and_other_classes() -> None:
-    truth = spread_out(12, 3)
-    errors = box_errors([frame(truth, truth[:0])], ["car", "Pedestrian"])
+    gt = spread_out(12, 3)
+    errors = box_errors([frame(gt, gt[:0])], ["car", "Pedestrian"])
     car, pedestrian = errors["car"], errors["Pedestrian"]
     assert (car["overall"].objects, car["overall"].matched, car.ate, car.aoe) == (12, 0, 1.0, 1.0)
     assert math.isnan(car["overall"].mean["x"])
     assert pedestrian["overall"].objects == 0
     assert math.isnan(pedestrian.ate)
-    one = box_errors([frame(truth, truth[:1])], ["Car"])["Car"]
+    one = box_errors([frame(gt, gt[:1])], ["Car"])["Car"]
     assert (one["overall"].matched, one.ate) == (1, 1.0), "a recall of 1/12 is below nuScenes' least"
     content = json.loads(json.dumps(errors.to_json(), allow_nan=False))
     assert content["car"]["overall"]["x"] == {"mean": None, "spread": None}
@@ -158,13 +158,13 @@ def test_nothing_found_nothing_there_and_other_classes() -> None:
 
 
 def test_objects_beyond_hard_take_their_detection_and_count_for_nothing() -> None:
-    truth = spread_out(3, 5)
+    gt = spread_out(3, 5)
     image = torch.tensor([[0.0, 0, 100, 100], [0, 0, 100, 100], [0, 0, 0, 0]])
     attributes = ImageAttributes(
         torch.tensor([0.0, 0.9, 0.0]), torch.zeros(3, dtype=torch.int64), torch.zeros(3), image
     )
-    found = truth + torch.tensor([[0.0] * 7, [0.5, 0, 0, 0, 0, 0, 0], [0.0] * 7])
-    errors = box_errors([frame(truth, found, attributes=attributes)], ["Car"])["Car"]
+    det = gt + torch.tensor([[0.0] * 7, [0.5, 0, 0, 0, 0, 0, 0], [0.0] * 7])
+    errors = box_errors([frame(gt, det, attributes=attributes)], ["Car"])["Car"]
     assert (errors["overall"].objects, errors["overall"].matched) == (2, 2), (
         "truncated by 0.9; labelled without a camera"
     )
@@ -173,8 +173,8 @@ def test_objects_beyond_hard_take_their_detection_and_count_for_nothing() -> Non
 
 
 def test_table_names_units_and_numbers() -> None:
-    truth = spread_out(12, 3)
-    table = box_errors([frame(truth, truth + torch.tensor([0.12, 0, 0, 0, 0, 0, 0.1]))], ["Car", "Pedestrian"]).table()
+    gt = spread_out(12, 3)
+    table = box_errors([frame(gt, gt + torch.tensor([0.12, 0, 0, 0, 0, 0, 0.1]))], ["Car", "Pedestrian"]).table()
     assert "Car: ATE 0.120 m, ASE 0.000, AOE 0.100 rad (nuScenes, 2 m); 0.0 % point the other way" in table
     row = next(line for line in table.splitlines() if line.startswith("overall"))
     assert row.split()[:4] == ["overall", "12/12", "+12.0", "+-"]

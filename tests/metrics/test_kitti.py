@@ -111,7 +111,7 @@ def cars(number: int, first: int = 0) -> Labels:
     return Labels(boxes.reshape(-1, 7), ("Car",) * number)
 
 
-def found(labels: Labels, scores: torch.Tensor | list[float]) -> Detections:
+def det(labels: Labels, scores: torch.Tensor | list[float]) -> Detections:
     scores = torch.as_tensor(scores, dtype=torch.float32)
     return Detections(labels.boxes, scores, torch.zeros(len(labels), dtype=torch.int64), ("Car",))
 
@@ -122,7 +122,7 @@ def simple(labels: list[Labels], detections: list[Detections]) -> KittiResult:
 
 def test_four_objects_all_found_are_capped_except_in_all() -> None:
     labels = cars(4)
-    average = simple([labels], [found(labels, [0.9, 0.8, 0.7, 0.6])])["Car"].box3d[0]
+    average = simple([labels], [det(labels, [0.9, 0.8, 0.7, 0.6])])["Car"].box3d[0]
     assert average.r40 == pytest.approx(7.5)
     assert average.r11 == pytest.approx(9.0909, abs=1e-3)
     assert average.all_points == pytest.approx(100)
@@ -130,7 +130,7 @@ def test_four_objects_all_found_are_capped_except_in_all() -> None:
 
 def test_a_hundred_objects_all_found_give_100_and_eighty_give_80() -> None:
     labels = cars(100)
-    everything = found(labels, 1 - torch.arange(100) / 200)
+    everything = det(labels, 1 - torch.arange(100) / 200)
     full = simple([labels], [everything])["Car"]
     assert [a.r40 for a in full.bev] == pytest.approx([100])
     part = simple([labels], [everything[:80]])["Car"].box3d[0]
@@ -146,7 +146,7 @@ def test_ap_stays_within_bounds_and_a_late_false_positive_changes_nothing(seed: 
     for labels in frames:
         shifted = labels.boxes + torch.tensor(rng.normal(0, 0.12, labels.boxes.shape), dtype=torch.float32)
         scores = torch.tensor(rng.uniform(0.2, 1, len(labels)))
-        results.append(found(Labels(shifted, labels.names), scores))
+        results.append(det(Labels(shifted, labels.names), scores))
     before = simple(frames, results)["Car"].box3d[0]
     for value in (before.r40, before.r11, before.all_points):
         assert 0 <= value <= 100 + 1e-9
@@ -177,7 +177,7 @@ def test_memory_and_files_agree(tmp_path: Path) -> None:
     for _ in range(6):
         labels = camera_labels(cars(6), int(rng.integers(3)))
         near = labels.boxes + torch.tensor(rng.normal(0, 0.1, (6, 7)), dtype=torch.float32)
-        detections = found(Labels(near, labels.names), rng.uniform(0, 1, 6).round(3))
+        detections = det(Labels(near, labels.names), rng.uniform(0, 1, 6).round(3))
         frames.append((labels, detections, CALIBRATION))
         camera = CALIBRATION.to_camera(labels.boxes)
         assert labels.attributes is not None
@@ -237,7 +237,7 @@ def test_json_and_table_name_the_protocol(tmp_path: Path) -> None:
 def test_nothing_found_is_zero_and_no_objects_is_unknown() -> None:
     result = simple([cars(3)], [Detections.empty(("Car",))])
     assert result["Car"].box3d[0].r40 == 0
-    result = simple([Labels.empty()], [found(cars(2), [0.5, 0.4])])
+    result = simple([Labels.empty()], [det(cars(2), [0.5, 0.4])])
     assert math.isnan(result["Car"].box3d[0].r40)
     assert result.to_json()["Car"]["3d"]["all"] == [None]
     assert "the labels have no Car" in result.table() and "capped" not in result.table()
@@ -250,7 +250,7 @@ def test_labels_without_image_boxes_are_not_called_absent(tmp_path: Path) -> Non
     assert "the labels have 2 Car, but none that KITTI's levels count" in table and "--no-difficulty" in table
     assert "the labels have no Car" not in table and "the labels have no Cyclist" in table
     every = evaluate_files(*folders, classes=["Car"], no_difficulty=True)
-    assert every["Car"].objects == (2,) and every["Car"].labelled == 2
+    assert every["Car"].objects == (2,) and every["Car"].labeled == 2
 
 
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
@@ -279,12 +279,12 @@ def test_errors_say_what_to_do(tmp_path: Path) -> None:
 def test_errors_in_memory_say_what_to_do() -> None:
     labels = cars(1)
     with pytest.raises(BeamboxError, match="has no camera calibration"):
-        evaluate([(labels, found(labels, [0.5]), None)])
+        evaluate([(labels, det(labels, [0.5]), None)])
     with pytest.raises(BeamboxError, match="has no image attributes"):
-        evaluate([(labels, found(labels, [0.5]), CALIBRATION)])
+        evaluate([(labels, det(labels, [0.5]), CALIBRATION)])
     with pytest.raises(BeamboxError, match="no IoU threshold is known for class 'Tree'"):
-        evaluate([(labels, found(labels, [0.5]), None)], ["Tree"], no_difficulty=True)
+        evaluate([(labels, det(labels, [0.5]), None)], ["Tree"], no_difficulty=True)
     with pytest.raises(BeamboxError, match=r"'cat', which is not scored \(did you mean \"car\"\?\)"):
-        evaluate([(labels, found(labels, [0.5]), None)], min_overlap={"cat": 0.5}, no_difficulty=True)
+        evaluate([(labels, det(labels, [0.5]), None)], min_overlap={"cat": 0.5}, no_difficulty=True)
     with pytest.raises(BeamboxError, match="no frame was given"):
         evaluate([])

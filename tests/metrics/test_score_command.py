@@ -52,7 +52,7 @@ def test_score_stops_with_one_line(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1 and "1 of 1 frames have no result file" in done.stderr
     done = CliRunner().invoke(app, ["once", "--annotations", str(tmp_path / "none.json")])
     assert done.exit_code == 2
-    assert done.stderr.count("\n") == 1 and "does not exist" in done.stderr
+    assert done.stderr.count("\n") == 1 and "none.json is not there" in done.stderr
 
 
 def test_score_once_writes_the_documented_json(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ def random_frames(seed: int, count: int = 30, present: float = 0.9) -> list[Trac
     rng = np.random.default_rng(seed)
     owner = {0: 10, 1: 11, 2: 12}
     scores = {t: float(rng.uniform(0.2, 1)) for t in range(10, 40)}
-    made = []
+    drive = []
     for k in range(count):
         gt = [g for g in range(4) if rng.random() < present]
         if rng.random() < 0.15:
@@ -41,8 +41,8 @@ def random_frames(seed: int, count: int = 30, present: float = 0.9) -> list[Trac
             ids.append(30 + int(rng.integers(5)))
             rows.append([float(rng.uniform(0, 0.6)) for _ in gt])
         overlap = np.array(rows).reshape(len(ids), len(gt)).T.tolist()
-        made.append(frame(gt, ids, overlap, [scores[t] for t in ids]))
-    return made
+        drive.append(frame(gt, ids, overlap, [scores[t] for t in ids]))
+    return drive
 
 
 def test_perfect_tracks_score_one() -> None:

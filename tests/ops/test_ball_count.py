@@ -29,9 +29,9 @@ def by_tree(index, cell, radius):
     out = np.zeros(len(index), np.int64)
     for sample in np.unique(index[:, 0]):
         rows = np.flatnonzero(index[:, 0] == sample)
-        centres = (index[rows][:, [3, 2, 1]] + 0.5) * np.array(cell)
-        tree = cKDTree(np.unique(centres, axis=0))
-        out[rows] = tree.query_ball_point(centres, np.sqrt(radius**2 + 1e-6), return_length=True)
+        centers = (index[rows][:, [3, 2, 1]] + 0.5) * np.array(cell)
+        tree = cKDTree(np.unique(centers, axis=0))
+        out[rows] = tree.query_ball_point(centers, np.sqrt(radius**2 + 1e-6), return_length=True)
     return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.jit import jit, parallel_for
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,7 +33,7 @@ def test_run_in_blocks_covers_every_item_once(threads, count, length):
         workers.add(threading.get_ident())
         seen[start:stop] += 1
 
-    run_in_blocks(kernel, length)
+    parallel_for(kernel, length)
     assert (seen == 1).all()
     assert len(workers) <= count
 
@@ -46,13 +46,13 @@ def test_run_in_blocks_hands_on_an_error_of_any_block(threads):
             raise ZeroDivisionError("in the second block")
 
     with pytest.raises(ZeroDivisionError, match="second block"):
-        run_in_blocks(kernel, 10)
+        parallel_for(kernel, 10)
 
 
 def test_run_in_blocks_keeps_short_work_on_one_thread(threads):
     threads(2)
     blocks = []
-    run_in_blocks(lambda start, stop: blocks.append((start, stop)), 10, smallest=8)
+    parallel_for(lambda start, stop: blocks.append((start, stop)), 10, smallest=8)
     assert blocks == [(0, 10)]
 
 

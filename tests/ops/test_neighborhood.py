@@ -39,7 +39,7 @@ def test_attention_agrees_with_plain_loops(version, shape, window):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
-def test_no_copy_of_keys_and_values_for_each_neighbour():
+def test_no_copy_of_keys_and_values_for_each_neighbor():
     code = "import neighborhood; print(neighborhood.maps_added(128))"
     paths = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "benchmarks"), str(ROOT / "src")])}
     ran = subprocess.run([sys.executable, "-c", code], env=paths, capture_output=True, text=True, check=True)
@@ -51,11 +51,11 @@ def test_no_copy_of_keys_and_values_for_each_neighbour():
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_numba_attention_and_gradients_equal_reference(shape, window, dtype):
     ours, theirs = case(shape, window, dtype), case(shape, window, dtype)
-    got, want = cpu.neighborhood_attention(*ours, window), reference.neighborhood_attention(*theirs, window)
+    actual, want = cpu.neighborhood_attention(*ours, window), reference.neighborhood_attention(*theirs, window)
     close = {"rtol": 1e-10, "atol": 1e-12} if dtype == torch.float64 else {"rtol": 1e-4, "atol": 1e-5}
-    torch.testing.assert_close(got, want, **close)
+    torch.testing.assert_close(actual, want, **close)
     cotangent = torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
-    got.backward(cotangent)
+    actual.backward(cotangent)
     want.backward(cotangent)
     for mine, other in zip(ours, theirs):
         torch.testing.assert_close(mine.grad, other.grad, **close)
@@ -74,7 +74,7 @@ def test_attention_without_queries_is_the_mean_of_the_window(version):
 
 
 @VERSIONS
-def test_bias_belongs_to_the_offset_of_the_neighbour(version):
+def test_bias_belongs_to_the_offset_of_the_neighbor(version):
     zero = torch.zeros(1, 1, 8, 8, 1, dtype=torch.float64)
     value = torch.arange(64, dtype=torch.float64).view(1, 1, 8, 8, 1)
     bias = torch.zeros(1, 13, 13, dtype=torch.float64)
@@ -147,20 +147,20 @@ def test_attention_tells_what_is_wrong():
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision_on_the_cpu_takes_the_fast_version_in_float32(dtype, monkeypatch) -> None:
-    import beambox.ops.neighborhood as door
+    import beambox.ops.neighborhood as frontend
 
     chosen = []
-    real = door.choose
+    real = frontend.choose
     monkeypatch.setattr(
-        door, "choose", lambda name, backends, *given: chosen.append(given) or real(name, backends, *given)
+        frontend, "choose", lambda name, backends, *given: chosen.append(given) or real(name, backends, *given)
     )
     generator = torch.Generator().manual_seed(3)
     q, k, v = (torch.randn(1, 2, 9, 8, 4, generator=generator).to(dtype).requires_grad_() for _ in range(3))
     bias = torch.randn(2, 13, 13, generator=generator)
-    out = door.neighborhood_attention(q, k, v, bias, 7)
+    out = frontend.neighborhood_attention(q, k, v, bias, 7)
     assert out.dtype == dtype
     assert [tensor.dtype for tensor in chosen[0]] == [torch.float32] * 4
-    expected = door.reference.neighborhood_attention(q.double(), k.double(), v.double(), bias.double(), 7)
+    expected = frontend.reference.neighborhood_attention(q.double(), k.double(), v.double(), bias.double(), 7)
     assert torch.allclose(out.double(), expected, atol=2e-2)
     out.sum().backward()
     assert all(tensor.grad is not None and tensor.grad.dtype == dtype for tensor in (q, k, v))

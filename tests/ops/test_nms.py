@@ -35,9 +35,9 @@ def test_numba_nms_is_close_to_reference_on_many_boxes(threshold):
     generator = torch.Generator().manual_seed(1)
     boxes = random_boxes(1500, generator, 25, torch.float32)
     scores = (torch.rand(1500, generator=generator) * 50).round() / 50  # many ties
-    got, want = cpu.nms(boxes, scores, threshold), reference.nms(boxes, scores, threshold)
+    actual, want = cpu.nms(boxes, scores, threshold), reference.nms(boxes, scores, threshold)
     # The versions round differently in the last bits, so an overlap at the very threshold may flip one box.
-    assert loops.edit_distance(got.tolist(), want.tolist()) <= 1
+    assert loops.edit_distance(actual.tolist(), want.tolist()) <= 1
     assert len(want) > 50
 
 

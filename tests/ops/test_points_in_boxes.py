@@ -37,7 +37,7 @@ def test_numba_equals_reference_on_a_sweep():
 
 
 @VERSIONS
-def test_corners_faces_and_centres_are_inside_and_a_micrometre_further_is_not(version):
+def test_corners_faces_and_centers_are_inside_and_a_micrometre_further_is_not(version):
     boxes = random_boxes(20, torch.Generator().manual_seed(1), 40)
     corners = corners_3d(boxes)  # (20, 8, 3)
     faces = torch.stack([corners[:, face].mean(dim=1) for face in ([0, 1, 2, 3], [0, 1, 4, 5], [0, 3, 4, 7])], dim=1)

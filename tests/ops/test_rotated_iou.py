@@ -46,15 +46,15 @@ def awkward_pairs(count: int) -> tuple[torch.Tensor, torch.Tensor]:
 @VERSIONS
 def test_paired_iou_agrees_with_shapely(version):
     a, b = awkward_pairs(10_000)
-    got = {"area": [], "bev": [], "3d": []}
+    actual = {"area": [], "bev": [], "3d": []}
     for i, j in zip(a.split(40), b.split(40)):  # the diagonal of blocks
-        got["area"].append(version.intersection_bev(i, j).diagonal())
-        got["bev"].append(version.iou_bev(i, j).diagonal())
-        got["3d"].append(version.iou_3d(i, j).diagonal())
+        actual["area"].append(version.intersection_bev(i, j).diagonal())
+        actual["bev"].append(version.iou_bev(i, j).diagonal())
+        actual["3d"].append(version.iou_3d(i, j).diagonal())
     a, b = a.numpy(), b.numpy()
-    np.testing.assert_allclose(torch.cat(got["area"]), polygons.paired_intersection(a, b), atol=1e-5)
-    np.testing.assert_allclose(torch.cat(got["bev"]), polygons.paired_iou_bev(a, b), atol=1e-5)
-    np.testing.assert_allclose(torch.cat(got["3d"]), polygons.paired_iou_3d(a, b), atol=1e-5)
+    np.testing.assert_allclose(torch.cat(actual["area"]), polygons.paired_intersection(a, b), atol=1e-5)
+    np.testing.assert_allclose(torch.cat(actual["bev"]), polygons.paired_iou_bev(a, b), atol=1e-5)
+    np.testing.assert_allclose(torch.cat(actual["3d"]), polygons.paired_iou_3d(a, b), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["iou_bev", "iou_3d", "intersection_bev"])
@@ -65,9 +65,9 @@ def test_numba_equals_reference_on_all_pairs(name, dtype):
     b[:9] = a[:9]
     versions = {"iou_bev": (cpu.iou_bev, reference.iou_bev), "iou_3d": (cpu.iou_3d, reference.iou_3d)}
     fast, plain = versions.get(name, (cpu.intersection_bev, reference.intersection_bev))
-    got, want = fast(a, b), plain(a, b)
-    assert got.dtype == want.dtype == dtype
-    torch.testing.assert_close(got, want, rtol=0, atol=1e-12 if dtype == torch.float64 else 1e-6)
+    actual, want = fast(a, b), plain(a, b)
+    assert actual.dtype == want.dtype == dtype
+    torch.testing.assert_close(actual, want, rtol=0, atol=1e-12 if dtype == torch.float64 else 1e-6)
 
 
 @VERSIONS
@@ -143,10 +143,10 @@ def test_gradient_of_the_reference():
 
 def test_doors_give_gradients_where_asked_and_speed_otherwise():
     a = random_boxes(3, torch.Generator().manual_seed(6), 1).requires_grad_()
-    for door in (iou_bev, iou_3d, intersection_bev):
-        assert door(a, a.detach()).requires_grad
+    for frontend in (iou_bev, iou_3d, intersection_bev):
+        assert frontend(a, a.detach()).requires_grad
         with torch.no_grad():
-            assert not door(a, a).requires_grad
+            assert not frontend(a, a).requires_grad
 
 
 def test_doors_tell_what_is_wrong():

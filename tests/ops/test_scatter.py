@@ -83,10 +83,10 @@ def test_segment_max_shows_nan_and_takes_infinities(version):
 def test_numba_segment_max_equals_reference(rows, columns, size, dtype):
     values, segment = case(rows, columns, size, dtype, seed=rows)
     ours, theirs = values.clone().requires_grad_(), values.clone().requires_grad_()
-    got, want = cpu.segment_max(ours, segment, size), reference.segment_max(theirs, segment, size)
-    assert torch.equal(got, want)
-    cotangent = torch.randn(got.shape, generator=torch.Generator().manual_seed(1), dtype=dtype)
-    got.backward(cotangent)
+    actual, want = cpu.segment_max(ours, segment, size), reference.segment_max(theirs, segment, size)
+    assert torch.equal(actual, want)
+    cotangent = torch.randn(actual.shape, generator=torch.Generator().manual_seed(1), dtype=dtype)
+    actual.backward(cotangent)
     want.backward(cotangent)
     assert torch.equal(ours.grad, theirs.grad)
 

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from beambox.checks import BeamboxError
 from beambox.ops.sparse_conv import (
-    Geometry,
+    ConvSpec,
     Sites,
     SparseTensor,
     inverse_conv3d,
@@ -28,7 +28,7 @@ STRIDED = [  # kernel, stride, padding, dilation
     ((2, 3, 4), (3, 1, 2), (1, 2, 0), (1, 2, 1)),
     ((1, 3, 5), (1, 2, 3), (0, 3, 2), (1, 1, 1)),
 ]
-CENTRED = [  # kernel, dilation
+CENTERED = [  # kernel, dilation
     ((3, 3, 3), (1, 1, 1)),
     ((3, 3, 3), (1, 2, 2)),
     ((1, 3, 3), (1, 1, 1)),
@@ -101,14 +101,14 @@ def test_sparse_conv_activates_exactly_what_an_active_input_reaches(
     x = random_sparse(2, (7, 9, 8), batch, density, 1)
     occupied = x.with_features(torch.ones_like(x.features)).to_dense()
     reached = F.conv3d(occupied, torch.ones((1, 1, *kernel)).double(), None, stride, padding, dilation)[:, 0] > 0
-    out = kernel_map(x.sites, Geometry(kernel, stride, padding, dilation)).target
+    out = kernel_map(x.sites, ConvSpec(kernel, stride, padding, dilation)).target
     assert out.indices.equal(torch.nonzero(reached))
     assert out.shape == tuple(reached.shape[1:])
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize(("density", "batch", "c_in", "c_out"), INPUTS)
-@pytest.mark.parametrize(("kernel", "dilation"), CENTRED)
+@pytest.mark.parametrize(("kernel", "dilation"), CENTERED)
 def test_submanifold_conv_matches_dense(backend, kernel, dilation, density, batch, c_in, c_out, dtype):
     x = random_sparse(3, (7, 9, 8), batch, density, c_in, dtype)
     weight, bias = parameters(kernel, c_in, c_out, dtype)
@@ -127,7 +127,7 @@ def test_submanifold_conv_matches_dense(backend, kernel, dilation, density, batc
 def test_inverse_conv_matches_dense_transposed_conv(backend, kernel, stride, padding, dilation):
     fine = random_sparse(4, (7, 9, 8), 2, 0.2, 3)
     weight, bias = parameters(kernel, 5, 4, torch.float64)
-    coarse_sites = kernel_map(fine.sites, Geometry(kernel, stride, padding, dilation)).target
+    coarse_sites = kernel_map(fine.sites, ConvSpec(kernel, stride, padding, dilation)).target
     coarse = SparseTensor(torch.randn(len(coarse_sites), 5, dtype=torch.float64), coarse_sites)
 
     def dense(x, w, b):
@@ -153,7 +153,7 @@ def test_layers_on_the_same_sites_share_one_map():
     weight = torch.randn(3, 3, 3, 3, 3, dtype=torch.float64)
     once = submanifold_conv3d(x, weight)
     submanifold_conv3d(once, weight)
-    assert list(x.sites.maps) == [Geometry.centred((3, 3, 3))]
+    assert list(x.sites.maps) == [ConvSpec.centered((3, 3, 3))]
 
 
 @pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
@@ -174,7 +174,7 @@ def test_empty_samples_give_what_dense_gives(backend, empty):
     assert out.to_dense().shape == (2, 4, 3, 4, 3)
 
 
-def test_a_single_voxel_sees_the_centre_of_the_kernel_only():
+def test_a_single_voxel_sees_the_center_of_the_kernel_only():
     x = SparseTensor.of(torch.tensor([[2.0]]), torch.tensor([[0, 1, 1, 1]]), (3, 3, 3), 1)
     weight = torch.arange(27.0).reshape(3, 3, 3, 1, 1)
     assert submanifold_conv3d(x, weight).features.tolist() == [[26.0]]
@@ -220,13 +220,13 @@ def test_sorting_keeps_the_tensor():
 @pytest.mark.parametrize(("shape", "chain"), [((41, 32, 32), [21, 11, 5, 2]), ((28, 32, 32), [14, 7, 3, 1])])
 def test_height_chain_of_the_eightfold_backbone(shape, chain):
     heights = []
-    for geometry in (
-        Geometry((3, 3, 3), (2, 2, 2), (1, 1, 1)),
-        Geometry((3, 3, 3), (2, 2, 2), (1, 1, 1)),
-        Geometry((3, 3, 3), (2, 2, 2), (0, 1, 1)),
-        Geometry((3, 1, 1), (2, 1, 1)),
+    for spec in (
+        ConvSpec((3, 3, 3), (2, 2, 2), (1, 1, 1)),
+        ConvSpec((3, 3, 3), (2, 2, 2), (1, 1, 1)),
+        ConvSpec((3, 3, 3), (2, 2, 2), (0, 1, 1)),
+        ConvSpec((3, 1, 1), (2, 1, 1)),
     ):
-        shape = geometry.output_shape(shape)
+        shape = spec.output_shape(shape)
         heights.append(shape[0])
     assert heights == chain
 

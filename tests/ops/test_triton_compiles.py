@@ -81,11 +81,11 @@ def test_attention_compiles(kept, given, ones):
     sizes["deep"] = 1 if ones else 32
     compile_kernel(gpu._attend, q=given, k=given, v=given, bias=given, out=given, log_total=kept, **sizes)
     compile_kernel(
-        gpu._to_queries, q=given, k=given, v=given, bias=given, log_total=kept, mean=kept, gradient=given, weights=kept,
-        slopes=kept, dq=given, **sizes,
+        gpu._to_queries, q=given, k=given, v=given, bias=given, log_total=kept, mean=kept, grad_out=given, weights=kept,
+        grad_logits=kept, dq=given, **sizes,
     )  # fmt: skip
     compile_kernel(
-        gpu._to_keys, q=given, weights=kept, slopes=kept, gradient=given, dk=given, dv=given, row_low="*i64",
+        gpu._to_keys, q=given, weights=kept, grad_logits=kept, grad_out=given, dk=given, dv=given, row_low="*i64",
         row_high="*i64", **sizes,
     )  # fmt: skip
 
@@ -100,10 +100,10 @@ def test_sparse_convolution_compiles(values, bias, widths):
     sizes = {"rows": "i32", "offsets": "i32", "c_in": "i32", "c_out": "i32"}
     blocks = {"block": gpu.ROWS, "in_width": widths[0], "out_width": widths[1]}
     compile_kernel(
-        gpu._multiply, features=values, weight=values, bias=bias, table="*i32", out=values, **sizes, **blocks
+        gpu._forward, features=values, weight=values, bias=bias, table="*i32", out=values, **sizes, **blocks
     )  # fmt: skip
     compile_kernel(
-        gpu._accumulate, features=values, grad=values, table="*i32", parts="*fp32", **sizes, stretch="i32", **blocks
+        gpu._weight_grad, features=values, grad=values, table="*i32", parts="*fp32", **sizes, stretch="i32", **blocks
     )  # fmt: skip
 
 
@@ -133,7 +133,7 @@ def test_voxel_query_compiles(values):
 
     sizes = ("count", "sites", "steps", "nb", "nz", "ny", "nx", "rz", "ry", "rx", "samples")
     compile_kernel(
-        gpu._search, points=values, cells="*i64", centres=values, keys="*i64", order="*i64", found="*i64", limit=values,
+        gpu._search, points=values, cells="*i64", centers=values, keys="*i64", order="*i64", found="*i64", limit=values,
         **dict.fromkeys(sizes, "i32"), block=gpu.BLOCK,
     )  # fmt: skip
 

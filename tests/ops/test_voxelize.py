@@ -27,12 +27,12 @@ def cloud(count, generator, batch_size=2, dtype=torch.float32):
     return points, sample
 
 
-def assert_same(got: Voxels, want: Voxels):
-    assert torch.equal(got.index, want.index)
-    assert torch.equal(got.count, want.count)
-    assert torch.equal(got.voxel, want.voxel)
-    assert torch.equal(got.points, want.points)
-    assert (got.batch_size, got.grid) == (want.batch_size, want.grid)
+def assert_same(actual: Voxels, want: Voxels):
+    assert torch.equal(actual.index, want.index)
+    assert torch.equal(actual.count, want.count)
+    assert torch.equal(actual.voxel, want.voxel)
+    assert torch.equal(actual.points, want.points)
+    assert (actual.batch_size, actual.grid) == (want.batch_size, want.grid)
 
 
 @VERSIONS
@@ -40,12 +40,12 @@ def assert_same(got: Voxels, want: Voxels):
 @pytest.mark.parametrize("limits", [(None, None), (1, None), (None, 1), (3, 7)])
 def test_voxelize_agrees_with_plain_loop(version, count, limits):
     points, sample = cloud(count, torch.Generator().manual_seed(count))
-    got = version(points, sample, 3, GRID, *limits)
+    actual = version(points, sample, 3, GRID, *limits)
     rows, voxels = loops.voxelize(points.numpy(), sample.numpy(), GRID.minimum, GRID.cell, GRID.size, *limits)
-    assert torch.equal(got.points, points[rows])
-    assert got.index.tolist() == [list(key) for key in voxels]
-    assert got.count.tolist() == [len(v) for v in voxels.values()]
-    assert got.voxel.tolist() == [i for i, v in enumerate(voxels.values()) for _ in v]
+    assert torch.equal(actual.points, points[rows])
+    assert actual.index.tolist() == [list(key) for key in voxels]
+    assert actual.count.tolist() == [len(v) for v in voxels.values()]
+    assert actual.voxel.tolist() == [i for i, v in enumerate(voxels.values()) for _ in v]
 
 
 @VERSIONS

@@ -25,13 +25,13 @@ def rectangle_iou(a: tuple[float, float, float, float], b: tuple[float, float, f
 
 
 def assign_one_class(
-    anchors: list[list[float]], boxes: list[list[float]], matched: float, unmatched: float
+    anchors: list[list[float]], boxes: list[list[float]], matched_threshold: float, unmatched_threshold: float
 ) -> tuple[list[int], list[int]]:
     """Return for each anchor -1, 0 or 1, and the box it answers for."""
     table = [[rectangle_iou(nearest_rectangle(a), nearest_rectangle(b)) for b in boxes] for a in anchors]
     best = [max(row) for row in table]
     choice = [next(b for b, overlap in enumerate(row) if overlap >= max(row) - 1e-6) for row in table]
-    label = [1 if m >= matched else 0 if m < unmatched else -1 for m in best]
+    label = [1 if m >= matched_threshold else 0 if m < unmatched_threshold else -1 for m in best]
     for b in range(len(boxes)):
         column = [row[b] for row in table]
         if max(column) > 0:

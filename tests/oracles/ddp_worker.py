@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from beambox.train.log import Clock
+from beambox.train.log import Timer
 from beambox.train.loop import Run
 from oracles.tiny_training import recipe, tiny_run
 
@@ -20,7 +20,7 @@ def steps_of(run: Run) -> list[float]:
     totals = []
     run.module.eval()
     for step in range(STEPS):
-        losses, _ = run.advance(run.feed[step], Clock())
+        losses, _ = run.train_step(run.dataset[step], Timer())
         total = run.fabric.all_reduce(losses["total"])
         assert isinstance(total, torch.Tensor)
         totals.append(total.item())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from shapely.geometry import Polygon
 
 MIN_HEIGHT, MAX_OCCLUSION, MAX_TRUNCATION = (40, 25, 25), (0, 1, 2), (0.15, 0.30, 0.50)
-NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
+NEIGHBORS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
 @dataclass
@@ -80,7 +80,7 @@ def flags(truth: list[Row], found: list[Row], name: str, level: int) -> tuple[li
         if row.name == name:
             truth_flags.append(1 if hard else 0)
         else:
-            truth_flags.append(1 if row.name == NEIGHBOURS.get(name) else -1)
+            truth_flags.append(1 if row.name == NEIGHBORS.get(name) else -1)
     for row in found:
         if int(abs(row.image[3] - row.image[1])) < MIN_HEIGHT[level]:
             found_flags.append(1)

@@ -66,15 +66,15 @@ class Launches(TorchDispatchMode):
         out = func(*args, **(kwargs or {}))
         name = func.overloadpacket._qualified_op_name.split("::")[-1]
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-        made = [leaf for leaf in tree_leaves(out) if isinstance(leaf, Tensor)]
+        outputs = [leaf for leaf in tree_leaves(out) if isinstance(leaf, Tensor)]
         if given and all(place_of(tensor) in self.home for tensor in given):  # the host's own work
-            self.home.update((place_of(tensor), tensor) for tensor in made)
+            self.home.update((place_of(tensor), tensor) for tensor in outputs)
             return out
         if is_view(func) or name in NOTHING:
             return out
         self.operations[name] += 1
-        self.bytes += sum(tensor.numel() * tensor.element_size() for tensor in (*given, *made))
-        if name in READS or reads_by_mask(name, given) or goes_home(name, given, made):
+        self.bytes += sum(tensor.numel() * tensor.element_size() for tensor in (*given, *outputs))
+        if name in READS or reads_by_mask(name, given) or goes_home(name, given, outputs):
             self.reads[name] += 1
         return out
 
@@ -118,8 +118,8 @@ def reads_by_mask(name: str, given: list[Tensor]) -> bool:
     )
 
 
-def goes_home(name: str, given: list[Tensor], made: list[Tensor]) -> bool:
+def goes_home(name: str, given: list[Tensor], outputs: list[Tensor]) -> bool:
     """Whether something is copied from a device to the CPU."""
     if name == "copy_":
         return given[0].device.type == "cpu" and given[-1].device.type != "cpu"
-    return name == "_to_copy" and bool(made) and made[0].device.type == "cpu" and given[0].device.type != "cpu"
+    return name == "_to_copy" and bool(outputs) and outputs[0].device.type == "cpu" and given[0].device.type != "cpu"

@@ -19,29 +19,29 @@ from oracles.small_detectors import total
 def learn_by_heart(model: Any, frame: Frame, steps: int, lr: float, clip: float = float("inf")) -> list[float]:
     """Repeat one sweep with Adam; dropout and random regions stay on. Returns the loss of every step."""
     batch = Batch.of([frame])
-    optimiser = torch.optim.Adam(model.train().parameters(), lr=lr)
+    optimizer = torch.optim.Adam(model.train().parameters(), lr=lr)
     losses = []
     for _ in range(steps):
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss = total(model.loss(model(batch, labels=batch.labels), batch.labels))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), clip)
-        optimiser.step()
+        optimizer.step()
         losses.append(float(loss.detach()))
     return losses
 
 
-def check_found(found: Tensor, labelled: Tensor) -> None:
+def check_found(found: Tensor, labeled: Tensor) -> None:
     """Every labelled box is found within half a metre, and nothing else is."""
-    distance = torch.cdist(found[:, :2], labelled[:, :2])
+    distance = torch.cdist(found[:, :2], labeled[:, :2])
     assert float(distance.amin(dim=0).max()) < 0.5, "every labelled car is found"
     assert float(distance.amin(dim=1).max()) < 0.5, "nothing else is found"
 
 
-def check_headings(found: Tensor, labelled: Tensor) -> None:
+def check_headings(found: Tensor, labeled: Tensor) -> None:
     """Each found box leads where the nearest labelled one does, within half a radian."""
-    nearest = torch.cdist(found[:, :2], labelled[:, :2]).argmin(dim=1)
-    assert float(wrap_angle(found[:, 6] - labelled[nearest, 6]).abs().max()) < 0.5
+    nearest = torch.cdist(found[:, :2], labeled[:, :2]).argmin(dim=1)
+    assert float(wrap_angle(found[:, 6] - labeled[nearest, 6]).abs().max()) < 0.5
 
 
 def scan_with_cars(grid: VoxelGrid) -> Frame:

@@ -40,8 +40,8 @@ def write_pandaset(root: Path, frames: int = 3, config: str = "", change: object
     for seed in range(frames):
         points, boxes = scene(seed)
         write_sweep(root / "velodyne" / f"{seed:02d}.bin", points)
-        labelled = change(boxes.copy()) if callable(change) else boxes
-        lines = ["# label x y z l w h yaw"] + ["Car " + " ".join(f"{v:.4f}" for v in box) for box in labelled]
+        labeled = change(boxes.copy()) if callable(change) else boxes
+        lines = ["# label x y z l w h yaw"] + ["Car " + " ".join(f"{v:.4f}" for v in box) for box in labeled]
         (root / "boxes").mkdir(exist_ok=True)
         (root / "boxes" / f"{seed:02d}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     path = root / "data.yaml"

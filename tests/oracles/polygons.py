@@ -7,7 +7,7 @@ import shapely
 
 
 def rectangles(boxes: np.ndarray) -> np.ndarray:
-    """Return the shapely polygon of each (N, 7) box seen from above."""
+    """Return the shapely polygon of each (N, 7) box in BEV."""
     x, y, _, length, width, _, yaw = boxes.astype(np.float64).T
     along = np.stack((np.cos(yaw), np.sin(yaw)), axis=1) * (length / 2)[:, None]
     across = np.stack((-np.sin(yaw), np.cos(yaw)), axis=1) * (width / 2)[:, None]
@@ -17,7 +17,7 @@ def rectangles(boxes: np.ndarray) -> np.ndarray:
 
 
 def paired_intersection(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the area shared by each row of a with the same row of b, seen from above."""
+    """Return the area shared by each row of a with the same row of b, in BEV."""
     return shapely.area(shapely.intersection(rectangles(a), rectangles(b)))
 
 

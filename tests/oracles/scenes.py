@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from beambox.data.footprints import overlap_bev
+from beambox.data.bev_overlap import bev_overlap
 from beambox.structures import Frame, Labels
 
 
@@ -15,7 +15,7 @@ def scene(seed: int, objects: int = 4, name: str = "Car", ground: int = 600, per
     boxes = np.zeros((0, 7))
     while len(boxes) < objects:
         box = np.array([[rng.uniform(5, 45), rng.uniform(-20, 20), -0.95, 4, 1.8, 1.5, rng.uniform(-3.1, 3.1)]])
-        if not overlap_bev(box, boxes).any():
+        if not bev_overlap(box, boxes).any():
             boxes = np.concatenate((boxes, box))
     clouds = []
     for x, y, z, length, width, height, yaw in boxes:

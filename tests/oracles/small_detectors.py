@@ -9,18 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from beambox.detectors.catalogue import CATALOGUE
-from beambox.detectors.dennet import AttentionPosition, CountSet, DenNetConfig, Normalisation
+from beambox.detectors.catalog import CATALOG
+from beambox.detectors.dennet import AttentionPosition, CountSet, DenNetConfig, Normalization
 from beambox.detectors.hcnet import Gate, HCNetConfig, HeightChannelKind
-from beambox.detectors.kassd import KamOptions, KassdConfig, KassdPredictions, Neck
+from beambox.detectors.kassd import KamOptions, KASSDConfig, KASSDPredictions, Neck
 from beambox.detectors.kassd.keypoints import ExtraPoint, KeypointLayout
 from beambox.detectors.pointpillars import PointPillarsConfig
-from beambox.detectors.second import KITTI_CAR, SecondConfig
-from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, VoxelRcnnPredictions
+from beambox.detectors.second import KITTI_CAR, SECONDConfig
+from beambox.detectors.voxel_rcnn import VoxelRCNNConfig, VoxelRCNNPredictions
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.layers.heads import AnchorPredictions
-from beambox.layers.roi import ProposalLimits, RoiSampling
+from beambox.layers.roi import NmsConfig, RoiSampling
 from beambox.structures import Frame, Labels
 
 CAR = [6.0, 1.0, -1.0, 4.0, 1.7, 1.5, 0.4]
@@ -33,7 +33,7 @@ POINTPILLARS = PointPillarsConfig(
     depths=(1, 1, 1),
     widths=(8, 8, 16),
     up_widths=(8, 8, 8),
-    centred_anchors=True,
+    centered_anchors=True,
 )
 HCNET = HCNetConfig(
     grid=VoxelGrid((0, -10.24, -3), (20.48, 10.24, 1), (0.32, 0.32, 1)),
@@ -45,25 +45,25 @@ HCNET = HCNetConfig(
     head_depth=1,
     head_width=16,
     oifm_width=8,
-    centred_anchors=True,
+    centered_anchors=True,
 )
 VOXELS = VoxelGrid((0.0, -6.4, -3.0), (12.8, 6.4, 1.0), (0.1, 0.1, 0.1))
 ENCODER: dict[str, Any] = {"encoder_widths": (4, 4, 8, 8), "encoder_out": 8}
-SECOND: SecondConfig = replace(KITTI_CAR, grid=VOXELS, depths=(1, 1), widths=(8, 8), up_widths=(8, 8), **ENCODER)
-KASSD = KassdConfig(grid=VOXELS, width=8, kam_width=8, centred_anchors=True, **ENCODER)
+SECOND: SECONDConfig = replace(KITTI_CAR, grid=VOXELS, depths=(1, 1), widths=(8, 8), up_widths=(8, 8), **ENCODER)
+KASSD_CONFIG = KASSDConfig(grid=VOXELS, width=8, kam_width=8, centered_anchors=True, **ENCODER)
 TWO_STAGES: dict[str, Any] = {
     **ENCODER,
     "anchors": KITTI_ANCHORS[:1],
     "depths": (1, 1),
     "widths": (8, 8),
     "up_widths": (8, 8),
-    "train_proposals": ProposalLimits(200, 20, 0.8),
-    "test_proposals": ProposalLimits(100, 10, 0.7),
-    "sampling": RoiSampling(per_sample=8),
-    "lattice": 2,
+    "train_proposals": NmsConfig(200, 20, 0.8),
+    "test_proposals": NmsConfig(100, 10, 0.7),
+    "sampling": RoiSampling(rois_per_frame=8),
+    "grid_size": 2,
     "roi_width": 16,
 }
-VOXEL_RCNN = VoxelRcnnConfig(grid=VOXELS, **TWO_STAGES)
+VOXEL_RCNN = VoxelRCNNConfig(grid=VOXELS, **TWO_STAGES)
 DENNET = DenNetConfig(
     grid=VoxelGrid((0.0, -6.4, -3.0), (12.8, 6.4, 3.0), (0.2, 0.2, 0.15)),
     density_depth=4,
@@ -73,7 +73,7 @@ DENNET = DenNetConfig(
 SMALL: dict[str, Any] = {
     "dennet": DENNET,
     "hcnet": HCNET,
-    "kassd": KASSD,
+    "kassd": KASSD_CONFIG,
     "pointpillars": POINTPILLARS,
     "second": SECOND,
     "voxel_rcnn": VOXEL_RCNN,
@@ -86,42 +86,44 @@ VARIANTS: dict[str, Any] = {
     "hcnet: 8 slices, 3 classes": replace(
         HCNET, grid=VoxelGrid((0, -10.24, -3), (20.48, 10.24, 1), (0.32, 0.32, 0.5)), anchors=KITTI_ANCHORS
     ),
-    "kassd: baseline": replace(KASSD, llm=False, kam=False),
-    "kassd: plain LLM": replace(KASSD, frs_reuse=False, lam=False),
-    "kassd: PSA, corners": replace(KASSD, neck=Neck.PSA, keypoints=KeypointLayout(2, 2, 0, 0)),
-    "kassd: DenseASPP, inner": replace(KASSD, neck=Neck.DENSEASPP, keypoints=KeypointLayout(0, 0, 6, 3)),
-    "kassd: SPP, centre": replace(KASSD, neck=Neck.SPP, keypoints=KeypointLayout(extra_point=ExtraPoint.CENTER)),
+    "kassd: baseline": replace(KASSD_CONFIG, llm=False, kam=False),
+    "kassd: plain LLM": replace(KASSD_CONFIG, frs_reuse=False, lam=False),
+    "kassd: PSA, corners": replace(KASSD_CONFIG, neck=Neck.PSA, keypoints=KeypointLayout(2, 2, 0, 0)),
+    "kassd: DenseASPP, inner": replace(KASSD_CONFIG, neck=Neck.DENSEASPP, keypoints=KeypointLayout(0, 0, 6, 3)),
+    "kassd: SPP, centre": replace(KASSD_CONFIG, neck=Neck.SPP, keypoints=KeypointLayout(extra_point=ExtraPoint.CENTER)),
     "kassd: SECOND, soft": replace(
-        KASSD, neck=Neck.SECOND, kam_options=KamOptions(soft_targets=True, box_gradient=True)
+        KASSD_CONFIG, neck=Neck.SECOND, kam_options=KamOptions(soft_targets=True, box_gradient=True)
     ),
-    "kassd: 3 classes": replace(KASSD, anchors=KITTI_ANCHORS, kam_options=KamOptions(positive_iou=(0.7, 0.5, 0.5))),
+    "kassd: 3 classes": replace(
+        KASSD_CONFIG, anchors=KITTI_ANCHORS, kam_options=KamOptions(positive_iou=(0.7, 0.5, 0.5))
+    ),
     "dennet: middle, points": replace(
         DENNET, na_position=AttentionPosition.MIDDLE, na_mlp=False, count_set=CountSet.POINTS, own_points=True
     ),
     "dennet: share, collapsed, no NA": replace(
-        DENNET, normalisation=Normalisation.SHARE, max_count=16, density_collapse=True, na=False
+        DENNET, normalization=Normalization.SHARE, max_count=16, density_collapse=True, na=False
     ),
 }
 """The small ones, and others with their switches set; the name before the colon is the catalogue's."""
 
 
-def made(name: str, config: Any = None, seed: int = 0) -> Any:
+def build_small(name: str, config: Any = None, seed: int = 0) -> Any:
     """Return a detector with random weights, in training mode; the small one of its name without a configuration."""
     torch.manual_seed(seed)
-    return CATALOGUE[name].build(config or SMALL[name])
+    return CATALOG[name].build(config or SMALL[name])
 
 
 def first_stage(predictions: Any) -> AnchorPredictions:
     """Return what the anchors of any detector say."""
-    if isinstance(predictions, VoxelRcnnPredictions):
+    if isinstance(predictions, VoxelRCNNPredictions):
         return predictions.first
-    return predictions.head if isinstance(predictions, KassdPredictions) else predictions
+    return predictions.head if isinstance(predictions, KASSDPredictions) else predictions
 
 
-def said(predictions: Any) -> list[Tensor]:
+def output_tensors(predictions: Any) -> list[Tensor]:
     """Return the maps of a detector's predictions, ``(B, ...)`` each."""
     first = first_stage(predictions)
-    maps = predictions.maps if isinstance(predictions, KassdPredictions) else None
+    maps = predictions.maps if isinstance(predictions, KASSDPredictions) else None
     return [first.cls, first.box, first.direction, *([] if maps is None else [maps])]
 
 

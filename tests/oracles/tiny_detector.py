@@ -30,7 +30,7 @@ def tiny_model(seed: int = 0) -> PointPillars:
             up_strides=(1, 2),
             up_widths=(8, 8),
             absolute_xy=False,
-            centred_anchors=True,
+            centered_anchors=True,
         )
     )
     norms = [layer for layer in model.modules() if isinstance(layer, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d)]
@@ -60,7 +60,7 @@ def tiny_weights(folder: Path, **card: object) -> Path:
 
 
 def street(seed: int = 0, *, height: float = 1.73, ahead_only: bool = False) -> np.ndarray:
-    """Return ``(N, 4)`` float32 points of a flat street with walls and three blocks, seen from above its ground."""
+    """Return ``(N, 4)`` float32 points of a flat street with walls and three blocks, in BEV its ground."""
     rng = np.random.default_rng(seed)
     ground = np.stack(
         (rng.uniform(-40, 40, 12000), rng.uniform(-15, 15, 12000), rng.normal(-height, 0.02, 12000)), axis=1
@@ -74,8 +74,8 @@ def street(seed: int = 0, *, height: float = 1.73, ahead_only: bool = False) -> 
         axis=1,
     )
     blocks = [
-        np.array(centre) + rng.uniform(-0.5, 0.5, (300, 3)) * (4.0, 1.7, 1.5)
-        for centre in ((10, 2, 0.75 - height), (18, -4, 0.75 - height), (-12, 3, 0.75 - height))
+        np.array(center) + rng.uniform(-0.5, 0.5, (300, 3)) * (4.0, 1.7, 1.5)
+        for center in ((10, 2, 0.75 - height), (18, -4, 0.75 - height), (-12, 3, 0.75 - height))
     ]
     xyz = np.concatenate((ground, walls, *blocks))
     if ahead_only:

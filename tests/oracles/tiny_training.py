@@ -12,12 +12,12 @@ import torch
 from beambox.data.kitti import write_kitti_frame
 from beambox.data.mixture import MixedSource
 from beambox.data.source import FrameList
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.simulate.frames import CAMERA
 from beambox.structures import Frame, ImageAttributes, Labels
 from beambox.train.config import Recipe, parse_recipe
+from beambox.train.dataset import TrainingDataset
 from beambox.train.devices import make_fabric
-from beambox.train.feed import Feed
 from beambox.train.loop import Run
 
 OPTIONS: dict[str, Any] = {
@@ -34,15 +34,15 @@ OPTIONS: dict[str, Any] = {
 def frames(count: int, seed: int = 0) -> FrameList:
     """Return frames of ground and one car each, made of random points."""
     rng = np.random.default_rng(seed)
-    made = []
+    items = []
     for number in range(count):
-        centre = np.array([rng.uniform(3, 10), rng.uniform(-4, 4), -1.0])
-        car = centre + rng.uniform(-0.5, 0.5, (60, 3)) * (3.9, 1.6, 1.5)
+        center = np.array([rng.uniform(3, 10), rng.uniform(-4, 4), -1.0])
+        car = center + rng.uniform(-0.5, 0.5, (60, 3)) * (3.9, 1.6, 1.5)
         ground = np.column_stack((rng.uniform(0, 12, 200), rng.uniform(-6, 6, 200), np.full(200, -1.75)))
         points = np.column_stack((np.concatenate((car, ground)), rng.uniform(0, 1, 260)))
-        labels = Labels(torch.tensor([[*centre, 3.9, 1.6, 1.5, 0.0]]), ("Car",))
-        made.append(Frame(torch.tensor(points, dtype=torch.float32), f"{number:06d}", labels))
-    return FrameList(made)
+        labels = Labels(torch.tensor([[*center, 3.9, 1.6, 1.5, 0.0]]), ("Car",))
+        items.append(Frame(torch.tensor(points, dtype=torch.float32), f"{number:06d}", labels))
+    return FrameList(items)
 
 
 def tiny_kitti(root: Path, count: int = 5, name: str = "Car") -> Path:
@@ -92,23 +92,23 @@ def shuffled(frame: Frame, rng: np.random.Generator, position: int) -> Frame:
 
 
 def tiny_run(
-    folder: Path, made: Recipe | None = None, count: int = 5, window: tuple[int, int] | None = (16, 16)
+    folder: Path, run_recipe: Recipe | None = None, count: int = 5, window: tuple[int, int] | None = (16, 16)
 ) -> Run:
     """Return a run of the tiny detector that has not begun."""
-    made = made or recipe()
-    torch.manual_seed(made.seed)
-    detector = build(made.detector.name, made.detector.options)
-    fabric = make_fabric(made.precision)
+    run_recipe = run_recipe or recipe()
+    torch.manual_seed(run_recipe.seed)
+    detector = build(run_recipe.detector.name, run_recipe.detector.options)
+    fabric = make_fabric(run_recipe.precision)
     config = detector.config
-    feed = Feed(
+    dataset = TrainingDataset(
         MixedSource([frames(count)]),
         shuffled,
         config.classes,
         config.grid,
-        made.optim.batch,
+        run_recipe.optim.batch,
         window,
-        seed=made.seed,
+        seed=run_recipe.seed,
         rank=fabric.global_rank,
         world=fabric.world_size,
     )
-    return Run(made, detector, feed, fabric, folder)
+    return Run(run_recipe, detector, dataset, fabric, folder)

@@ -92,7 +92,7 @@ def test_two_stage_agrees():
             stages = network.encoder(mean_voxels(network.voxels(batch, grid)))
             pooled = network.roi_pool(Rois(given, zeros, zeros, 1), network.levels(stages), grid)
             refined = network.roi_head(pooled)
-            boxes = decode_rois(refined.codes, given)
+            boxes = decode_rois(refined.deltas, given)
         index = recorded["rpn_index"].long()
         assert relative_error(predictions.first.cls[0, index], recorded["rpn_cls"]) < RELATIVE
         compare_boxes(predictions.first.decoded()[0, index], recorded["rpn_box"])

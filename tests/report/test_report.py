@@ -117,7 +117,7 @@ def test_ap_of_all_objects_is_that_of_the_official_metric(seed: int) -> None:
         assert ap == pytest.approx(one.scored[name].box3d[0].all_points, abs=1e-9)  # type: ignore[index]
 
 
-def test_nothing_found_and_nothing_labelled_make_a_report() -> None:
+def test_nothing_found_and_nothing_labeled_make_a_report() -> None:
     empty = measure("nothing", [frame_of([("Car", 10, 0)], []), frame_of([], [])], CLASSES)
     point = numbers.working_point(empty.matches, "Car")
     assert math.isnan(point.score) and numbers.groups(empty.matches, "Car")[0].ap == 0
@@ -231,7 +231,7 @@ def test_a_browser_shows_classes_in_turn_and_enlarges_pictures(tmp_path: Path) -
     one = measure("a", random_frames(4), CLASSES)
     source = FrameList([Frame(torch.rand(300, 4) * 40, f"{k:06d}") for k in range(12)])
     write_page(tmp_path / "r.html", [one, measure("b", random_frames(5), CLASSES)], source, most=2)
-    told = run_in_browser(
+    result = run_in_browser(
         (tmp_path / "r.html").read_text(encoding="utf-8"),
         """
         const sections = [...document.querySelectorAll("section[data-class]")];
@@ -249,5 +249,5 @@ def test_a_browser_shows_classes_in_turn_and_enlarges_pictures(tmp_path: Path) -
         """,
         tmp_path,
     )
-    assert told["first"] == ["Car"] and told["second"] == ["Pedestrian"]
-    assert told["charts"] and told["large"] and told["closed"]
+    assert result["first"] == ["Car"] and result["second"] == ["Pedestrian"]
+    assert result["charts"] and result["large"] and result["closed"]

@@ -16,15 +16,15 @@ def placed(x: float, y: float, name: str = "Car") -> Placed:
 
 
 def test_occlusion_follows_the_share_of_beams_lost() -> None:
-    alone = np.array([100, 100, 100, 100, 100, 100, 0])
-    got = np.array([100, 86, 84, 51, 49, 7, 0])
-    np.testing.assert_array_equal(occlusion_level(alone, got), [0, 0, 1, 1, 2, 3, 3])
+    unoccluded_hits = np.array([100, 100, 100, 100, 100, 100, 0])
+    hits = np.array([100, 86, 84, 51, 49, 7, 0])
+    np.testing.assert_array_equal(occlusion_level(unoccluded_hits, hits), [0, 0, 1, 1, 2, 3, 3])
 
 
 def test_only_objects_that_are_met_and_shown_get_labels() -> None:
     things = [placed(20, 0), placed(20, 5), placed(-20, 0), placed(15, 0, ""), placed(10, 30)]
-    alone, got = np.array([100, 100, 100, 9, 50]), np.array([90, 0, 50, 9, 50])
-    labels = annotate(things, alone, got, CAMERA, SIZE, full=False)
+    unoccluded_hits, hits = np.array([100, 100, 100, 9, 50]), np.array([90, 0, 50, 9, 50])
+    labels = annotate(things, unoccluded_hits, hits, CAMERA, SIZE, full=False)
     assert labels.boxes[:, 0].tolist() == [20.0]
     attributes = labels.attributes
     assert attributes.truncation.tolist() == [0.0]

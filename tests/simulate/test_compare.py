@@ -42,7 +42,7 @@ def test_hidden_objects_other_classes_and_few_points_are_left_out() -> None:
     assert object_profiles([car(0.0, 0.3)], ("Car",), least=41) == []
 
 
-def test_unlabelled_frames_are_refused() -> None:
+def test_unlabeled_frames_are_refused() -> None:
     with pytest.raises(BeamboxError, match="frame bare has no labels"):
         object_profiles([Frame(torch.zeros(1, 4), id="bare")], ("Car",))
 

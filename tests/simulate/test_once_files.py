@@ -9,11 +9,11 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.once import ONCE_CLASSES, OnceSource
-from beambox.data.opening import open_data
+from beambox.data.open_dataset import open_dataset
 from beambox.geometry.axes import Axes, turn_boxes
 from beambox.ops.points_in_boxes import points_in_boxes
 from beambox.simulate import Sensor, simulate_frame, write_dataset
-from beambox.simulate.fleets import ONCE_FLEET
+from beambox.simulate.object_mix import ONCE_MIX
 from beambox.simulate.once_files import in_once_axes
 from beambox.structures import Labels
 
@@ -63,15 +63,15 @@ def test_written_frames_are_read_back(written) -> None:
     source = OnceSource(written, "all")
     assert list(source.ids) == [f"{i:06d}" for i in range(5)]
     for frame in source:
-        want = in_once_axes(simulate_frame(3, int(frame.id), sensor=QUICK, view="full", fleet=ONCE_FLEET))
+        want = in_once_axes(simulate_frame(3, int(frame.id), sensor=QUICK, view="full", object_mix=ONCE_MIX))
         assert torch.equal(frame.points, want.points)
         assert frame.labels.names == want.labels.names
         assert torch.equal(frame.labels.boxes, want.labels.boxes)
-    assert isinstance(open_data(written, "val"), OnceSource)
+    assert isinstance(open_dataset(written, "val"), OnceSource)
 
 
 def test_axes_are_once_s_and_boxes_hold_the_same_points() -> None:
-    frame = simulate_frame(1, 0, sensor=QUICK, view="full", fleet=ONCE_FLEET)
+    frame = simulate_frame(1, 0, sensor=QUICK, view="full", object_mix=ONCE_MIX)
     turned = in_once_axes(frame)
     assert torch.allclose(turned.points[:, 0], frame.points[:, 1])  # x to the left
     assert torch.allclose(turned.points[:, 1], -frame.points[:, 0])  # y backward
@@ -97,15 +97,15 @@ def test_workers_and_growth_change_nothing(written, tmp_path) -> None:
     assert contents(tmp_path / "grown") == contents(written)
 
 
-def test_fleet_has_once_s_five_classes_and_maps_vans() -> None:
+def test_object_mix_has_once_s_five_classes_and_maps_vans() -> None:
     names = set()
     for index in range(6):
-        names |= set(simulate_frame(2, index, sensor=QUICK, view="full", fleet=ONCE_FLEET).labels.names)
+        names |= set(simulate_frame(2, index, sensor=QUICK, view="full", object_mix=ONCE_MIX).labels.names)
     assert names == set(ONCE_CLASSES)
     boxes = torch.ones(4, 7)
-    labels = ONCE_FLEET.rename(Labels(boxes, ("Van", "Misc", "Tram", "Person_sitting")))
+    labels = ONCE_MIX.rename(Labels(boxes, ("Van", "Misc", "Tram", "Person_sitting")))
     assert labels.names == ("Car", "Bus", "Pedestrian")
-    assert len(ONCE_FLEET.rename(Labels.empty())) == 0
+    assert len(ONCE_MIX.rename(Labels.empty())) == 0
 
 
 def test_other_layouts_and_views_are_refused(written, tmp_path) -> None:

@@ -119,8 +119,8 @@ def test_losses_to_what_stands_before_are_counted() -> None:
         placed = [Placed(target, (12.0, 0.0, 0.0), 0.0, name="Car")]
         placed += [Placed(shape, (6.0, 0.0, 0.0), 0.0) for shape in before]
         hits = shoot(placed, azimuths, elevations)
-        assert hits.alone[0] > 300
-        return hits.got[0] / hits.alone[0]
+        assert hits.unoccluded_hits[0] > 300
+        return hits.hits[0] / hits.unoccluded_hits[0]
 
     assert share() == 1.0
     assert share(half) == pytest.approx(0.5, abs=0.02)

@@ -10,10 +10,10 @@ from beambox.simulate import SENSORS, Sensor, load_sensor, simulate_frame
 def test_hdl64_is_near_the_manufacturers_table() -> None:
     sensor = SENSORS["hdl64"]
     nominal = np.concatenate((2.0 - np.arange(32) / 3, -8.83 - np.arange(32) / 2))
-    got = np.array(sensor.elevations)
-    assert len(got) == 64
-    assert (np.diff(got) < 0).all()
-    assert np.abs(got - nominal).max() < 0.75
+    actual = np.array(sensor.elevations)
+    assert len(actual) == 64
+    assert (np.diff(actual) < 0).all()
+    assert np.abs(actual - nominal).max() < 0.75
     assert sensor.columns == 2003
     assert sensor.height == 1.73
 
@@ -61,9 +61,9 @@ def test_own_sensor_from_yaml_is_cast(tmp_path) -> None:
         ("elevations: [1]\nheight: 2\n", "lacks azimuth_step"),
         ("elevations: [1, x]\nheight: 2\nazimuth_step: 1\n", "elevations must be numbers"),
         ("elevations: [1]\nheight: 2\nazimuth_step: 0\n", "`azimuth_step` must be greater than 0, got 0.0"),
-        ("elevations: []\nheight: 2\nazimuth_step: 1\n", "`elevations` must hold one angle a beam"),
+        ("elevations: []\nheight: 2\nazimuth_step: 1\n", "`elevations` must hold one angle per beam"),
         ("elevations: [95]\nheight: 2\nazimuth_step: 1\n", "between -90 and 90"),
-        ("elevations: [1]\noffsets: [1, 2]\nheight: 2\nazimuth_step: 1\n", "must be empty or one a beam"),
+        ("elevations: [1]\noffsets: [1, 2]\nheight: 2\nazimuth_step: 1\n", "must be empty or one per beam"),
         ("- 1\n", "must hold keys and values, got list"),
         ("a: [1\n", "is not valid YAML"),
     ],

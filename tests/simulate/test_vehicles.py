@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from beambox.simulate import people, vehicles
-from beambox.simulate.fleets import SIZES, draw_size
 from beambox.simulate.ground import Ground
 from beambox.simulate.materials import AIR, GLASS, Palette
+from beambox.simulate.object_mix import SIZES, draw_size
 from beambox.simulate.raycast import Placed, cast, pack
 from oracles.marching import depth_inside, to_local
 

@@ -125,16 +125,16 @@ def test_a_damaged_sweep_is_left_out_and_a_jump_in_time_begins_anew(tmp_path: Pa
         stamp, points = round(seconds * 1e9), torch.tensor([[10.0, 2, -1, 0]])
         return Arrival(stamp, stamp, "/p", "lidar", str(k), broken if k == 2 else lambda: Frame(points))
 
-    times, ids, told = (0.0, 0.1, 0.2, 0.3, 9.0, 3.0), [], []
+    times, ids, notices = (0.0, 0.1, 0.2, 0.3, 9.0, 3.0), [], []
     report = run_stream(
         [arrival(k, t) for k, t in enumerate(times)],
         detect,
         Tracker(),
         lambda sweep, tracks: ids.append(tracks.ids.tolist()),
-        notice=told.append,
+        notice=notices.append,
     )
     assert ids == [[1], [1], [1], [2], [3]] and report.unreadable == ["2"]
-    assert [text.split(":")[0] for text in told] == ["left out", "4", "5"]
+    assert [text.split(":")[0] for text in notices] == ["left out", "4", "5"]
 
 
 def test_real_time_drops_old_sweeps_and_keeps_the_newest() -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.infer.predictor import Detector
 from beambox.structures import Frame, expect_columns
 

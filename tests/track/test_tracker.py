@@ -155,7 +155,7 @@ def test_what_cannot_be_tracked_is_refused() -> None:
     with pytest.raises(BeamboxError, match="`rate` must be a positive number"):
         Tracker(rate=0)
     with pytest.raises(BeamboxError, match="`birth_score`"):
-        TrackerOptions(min_score=0.5, birth_score=0.3)
+        TrackerOptions(score_threshold=0.5, birth_score=0.3)
 
 
 def test_without_the_library_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from beambox.checks import BeamboxError
 from beambox.cli import ablate
 from beambox.data.database import ObjectDatabase
 from beambox.data.source import FrameSource
-from beambox.detectors.catalogue import CATALOGUE, config_from_dict
+from beambox.detectors.catalog import CATALOG, config_from_dict
 from beambox.metrics.kitti_result import AveragePrecision, ClassResult, KittiResult
 from beambox.train import ablation
 from beambox.train.ablation import Interrupted, Timed, merged, report, row_recipe, run_table, to_json, value_at
@@ -35,7 +35,7 @@ TINY = Table(
     columns=COLUMNS,
     rows=(
         Row("quoted", (50.0, None)),
-        Row("centred", (60.0, 70.0), {"centred_anchors": True}),
+        Row("centred", (60.0, 70.0), {"centered_anchors": True}),
         Row("plain", (61.0, 71.0), {}),
     ),
     remarks=("a remark",),
@@ -64,18 +64,18 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_every_row_is_trained_for_every_seed_and_nothing_twice(tmp_path: Path, opened: list[str]) -> None:
-    said: list[str] = []
-    measured = run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], said.append)
+    messages: list[str] = []
+    measured = run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], messages.append)
     assert {name: len(runs) for name, runs in measured.items()} == {"centred": 2, "plain": 2}
     assert all(len(run) == 2 and all(v is not None for v in run) for runs in measured.values() for run in runs)
-    assert [line.split(":")[0] for line in said] == [
+    assert [line.split(":")[0] for line in messages] == [
         "row centred, seed 0 (1 of 4)",
         "row centred, seed 1 (2 of 4)",
         "row plain, seed 0 (3 of 4)",
         "row plain, seed 1 (4 of 4)",
     ]
     assert opened == ["val", "train", "train", "train", "train"]
-    again = run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], said.append)
+    again = run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], messages.append)
     assert again == measured
     assert opened[5:] == ["val"]
 
@@ -92,18 +92,18 @@ def test_once_is_scored_by_its_own_rules(tmp_path: Path, opened: list[str]) -> N
 
 
 def test_the_once_recipe_reads_the_layout_of_once(tmp_path: Path) -> None:
-    made = read_recipe("hcnet-once")
+    run_recipe = read_recipe("hcnet-once")
     with pytest.raises(BeamboxError, match=r"must hold the folder data/ \(ONCE's layout\)"):
-        open_source(made.data[0], tmp_path)
+        open_source(run_recipe.data[0], tmp_path)
 
 
 def test_rows_of_a_seed_start_from_the_same_random_numbers(tmp_path: Path, opened: list[str]) -> None:
     run_table(TINY, tiny_recipe(), None, tmp_path, [0, 1], lambda _: None)
     logs = {path.parent.name: path.read_text() for path in (tmp_path / "tiny" / "as-recipe").glob("*/log.jsonl")}
     assert len(logs) == 2
-    held = json.loads((tmp_path / "tiny" / "as-recipe" / "seed-1" / "recipe.json").read_text())
-    assert held["seed"] == 1
-    assert held["validation"] is None
+    stored = json.loads((tmp_path / "tiny" / "as-recipe" / "seed-1" / "recipe.json").read_text())
+    assert stored["seed"] == 1
+    assert stored["validation"] is None
 
 
 def test_an_interrupted_run_goes_on(tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,9 +196,9 @@ def test_switches_are_laid_over_the_recipes_options() -> None:
     base = {"a": 1, "inner": {"x": 1, "y": 2}}
     assert merged(base, {"inner": {"y": 3}, "b": 4}) == {"a": 1, "inner": {"x": 1, "y": 3}, "b": 4}
     assert base == {"a": 1, "inner": {"x": 1, "y": 2}}
-    made = row_recipe(tiny_recipe(), {"centred_anchors": True}, 7)
-    assert made.detector.options == {**tiny_training.OPTIONS, "centred_anchors": True}
-    assert made.seed == 7
+    run_recipe = row_recipe(tiny_recipe(), {"centered_anchors": True}, 7)
+    assert run_recipe.detector.options == {**tiny_training.OPTIONS, "centered_anchors": True}
+    assert run_recipe.seed == 7
 
 
 def test_folders_tell_switches_apart() -> None:
@@ -232,12 +232,12 @@ def test_report_keeps_the_papers_numbers_and_ours_on_lines_of_their_own() -> Non
 
 
 def test_json_keeps_them_apart_too() -> None:
-    told = to_json(TINY, {"plain": [[1.0, None]]}, tiny_recipe(), [3])
-    assert told["columns"] == ["Car 3-D all any", "Car BEV all any"]
-    assert told["seeds"] == [3]
-    assert told["rows"][2] == {"name": "plain", "options": {}, "paper": [61.0, 71.0], "ours": [[1.0, None]]}
-    assert told["rows"][0] == {"name": "quoted", "options": None, "paper": [50.0, None], "ours": []}
-    json.dumps(told)
+    written = to_json(TINY, {"plain": [[1.0, None]]}, tiny_recipe(), [3])
+    assert written["columns"] == ["Car 3-D all any", "Car BEV all any"]
+    assert written["seeds"] == [3]
+    assert written["rows"][2] == {"name": "plain", "options": {}, "paper": [61.0, 71.0], "ours": [[1.0, None]]}
+    assert written["rows"][0] == {"name": "quoted", "options": None, "paper": [50.0, None], "ours": []}
+    json.dumps(written)
 
 
 def test_columns_find_their_numbers_in_a_kitti_result() -> None:
@@ -267,8 +267,8 @@ def test_columns_find_their_numbers_in_a_once_result() -> None:
 
 
 def test_time_is_told_after_warming_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([0.0, 9.0, 10.0, 19.0, 20.0, 29.0, 30.0, 30.002, 40.0, 40.004, 50.0, 50.009])
-    monkeypatch.setattr("beambox.train.ablation.time.perf_counter", lambda: next(clock))
+    timer = iter([0.0, 9.0, 10.0, 19.0, 20.0, 29.0, 30.0, 30.002, 40.0, 40.004, 50.0, 50.009])
+    monkeypatch.setattr("beambox.train.ablation.time.perf_counter", lambda: next(timer))
     timed = Timed(lambda frames: [])
     assert timed.median() is None
     for _ in range(6):
@@ -279,14 +279,14 @@ def test_time_is_told_after_warming_up(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_name_a_recipe_of_ours_and_options_that_exist(name: str) -> None:
     table = TABLES[name]
-    made = read_recipe(table.recipe)
-    assert made.validation is not None
+    run_recipe = read_recipe(table.recipe)
+    assert run_recipe.validation is not None
     configs = []
     for row in table.rows:
         assert len(row.published) == len(table.columns)
         if row.options is not None:
-            options = row_recipe(made, row.options, 0).detector.options
-            configs.append(config_from_dict(CATALOGUE[made.detector.name].config, options))
+            options = row_recipe(run_recipe, row.options, 0).detector.options
+            configs.append(config_from_dict(CATALOG[run_recipe.detector.name].config, options))
     assert configs
     assert len({repr(config) for config in configs}) == len(configs), "two rows with the same switches"
 
@@ -344,12 +344,12 @@ def test_a_table_of_ones_own_is_trained_as_its_page_says(
     page = (ROOT / "docs" / "ablations.md").read_text(encoding="utf-8")
     text = page.split("```yaml\n")[1].split("```")[0]
     Path("mine.yaml").write_text(text, encoding="utf-8")
-    made = read_table(Path("mine.yaml"))
-    assert [(row.name, row.options) for row in made.rows] == [
+    run_recipe = read_table(Path("mine.yaml"))
+    assert [(row.name, row.options) for row in run_recipe.rows] == [
         ("without", {"absolute_xy": False}),
         ("with", {"absolute_xy": True}),
     ]
-    assert read_recipe(made.recipe).detector.name == "pointpillars"
+    assert read_recipe(run_recipe.recipe).detector.name == "pointpillars"
     Path("tiny.yaml").write_text(json.dumps(tiny_recipe().model_dump(mode="json")), encoding="utf-8")
     words = ["--table", "mine.yaml", "--recipe", "tiny.yaml", "--iterations", "1", "--set", "optim.batch=1"]
     done = run_command(*words)

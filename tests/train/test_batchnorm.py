@@ -10,14 +10,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from beambox.detectors.catalogue import CATALOGUE
+from beambox.detectors.catalog import CATALOG
 from beambox.detectors.weights import load_weights
 from beambox.structures import Batch
 from beambox.train.batchnorm import Moments, batch_norms, measure_statistics
-from beambox.train.feed import TrainingBatch
-from beambox.train.log import Clock, RunLog
-from beambox.train.loop import Run, TrainStep
-from oracles.small_detectors import CAR, car_frame, made
+from beambox.train.dataset import TrainingBatch
+from beambox.train.log import RunLog, Timer
+from beambox.train.loop import ModelWithLoss, Run
+from oracles.small_detectors import CAR, build_small, car_frame
 from oracles.tiny_training import frames, recipe, tiny_run
 
 
@@ -108,12 +108,12 @@ def test_measuring_does_not_disturb_training(tmp_path: Path) -> None:
     for step in range(4):
         for run in (plain, measured):
             run.module.train()
-            run.advance(run.feed[step], Clock())
-        held = {name: value.clone() for name, value in measured.result.state_dict().items()}
+            run.train_step(run.dataset[step], Timer())
+        saved = {name: value.clone() for name, value in measured.result.state_dict().items()}
         with measured.measured():
             inside = {name: value.clone() for name, value in measured.result.state_dict().items()}
-        assert any(not torch.equal(held[name], inside[name]) for name in held)
-        assert all(torch.equal(held[name], inside[name]) for name in held if "running" not in name)
+        assert any(not torch.equal(saved[name], inside[name]) for name in saved)
+        assert all(torch.equal(saved[name], inside[name]) for name in saved if "running" not in name)
     for one, other in ((plain.detector, measured.detector), (plain.result, measured.result)):
         assert all(torch.equal(v, other.state_dict()[k]) for k, v in one.state_dict().items())
 
@@ -124,19 +124,19 @@ def test_measured_statistics_are_a_function_of_weights_seed_and_step(tmp_path: P
         run = tiny_run(tmp_path, recipe().model_copy(update={"workers": workers}))
         for step in range(3):
             run.module.train()
-            run.advance(run.feed[step], Clock())
+            run.train_step(run.dataset[step], Timer())
         torch.manual_seed(workers)
         with run.measured():
             kept.append({name: value.clone() for name, value in run.result.state_dict().items()})
     assert all(torch.equal(value, kept[1][name]) for name, value in kept[0].items())
 
 
-@pytest.mark.parametrize("name", sorted(CATALOGUE))
+@pytest.mark.parametrize("name", sorted(CATALOG))
 def test_every_layer_of_every_detector_is_measured(name: str) -> None:
     """The second stages too, whose layers run in the loss alone."""
-    model = made(name)
+    model = build_small(name)
     work = TrainingBatch(Batch.of([car_frame(1, CAR), car_frame(2, CAR)]), None)
-    measure_statistics(model, [work], TrainStep(model))
+    measure_statistics(model, [work], ModelWithLoss(model))
     for layer_name, layer in batch_norms(model).items():
         assert layer.running_mean is not None
         assert layer.running_mean.any(), f"{layer_name} was not measured"
@@ -158,7 +158,7 @@ def test_short_run_scores_as_with_exact_statistics(tmp_path: Path) -> None:
     with run.measured():
         exported = moderate_ap(load_weights(run.export("final.safetensors", {})))
     exact = run.result
-    steps: list[Callable[[], object]] = [lambda i=i: exact(run.feed[i].batch) for i in range(200)]
+    steps: list[Callable[[], object]] = [lambda i=i: exact(run.dataset[i].batch) for i in range(200)]
     measure_statistics(exact, steps, lambda step: step())
     expected = moderate_ap(exact)
     assert expected > 30
@@ -168,7 +168,7 @@ def test_short_run_scores_as_with_exact_statistics(tmp_path: Path) -> None:
 
 def test_zero_batches_keep_the_moving_averages(tmp_path: Path) -> None:
     run: Run = tiny_run(tmp_path, recipe().model_copy(update={"batchnorm_batches": 0}))
-    run.advance(run.feed[0], Clock())
-    held = {name: value.clone() for name, value in run.result.state_dict().items()}
+    run.train_step(run.dataset[0], Timer())
+    saved = {name: value.clone() for name, value in run.result.state_dict().items()}
     with run.measured():
-        assert all(torch.equal(value, run.result.state_dict()[name]) for name, value in held.items())
+        assert all(torch.equal(value, run.result.state_dict()[name]) for name, value in saved.items())

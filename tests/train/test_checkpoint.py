@@ -50,9 +50,9 @@ def test_missing_truncated_pickled_and_foreign_files_are_refused(tmp_path: Path)
 def test_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
     tiny_run(tmp_path).save()
     wider = {**OPTIONS, "widths": [8, 16]}
-    made = recipe()
-    made = made.model_copy(update={"detector": made.detector.model_copy(update={"options": wider})})
-    run = tiny_run(tmp_path, made)
+    run_recipe = recipe()
+    run_recipe = run_recipe.model_copy(update={"detector": run_recipe.detector.model_copy(update={"options": wider})})
+    run = tiny_run(tmp_path, run_recipe)
     with pytest.raises(BeamboxError, match=r"last.safetensors holds the weights of another model: .* has shape"):
         run.restore()
 

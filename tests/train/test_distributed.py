@@ -17,13 +17,13 @@ from safetensors.torch import load_file
 from beambox.checks import BeamboxError
 from beambox.data.database import ObjectDatabase
 from beambox.data.mixture import MixedSource
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.detectors.weights import load_weights
 from beambox.train.batchnorm import batch_norms, measure_statistics
 from beambox.train.config import read_recipe
-from beambox.train.feed import Feed
+from beambox.train.dataset import TrainingDataset
 from beambox.train.preflight import check_recipe
-from beambox.train.sources import Change, open_source
+from beambox.train.sources import Augment, open_source
 from beambox.train.validate import Validator
 from oracles import ddp_train, ddp_worker
 from oracles.tiny_training import recipe, tiny_kitti, tiny_run
@@ -71,31 +71,31 @@ def test_a_whole_run_validates_in_shares_and_exports_statistics_of_all_processes
     scores = [output.splitlines()[-1] for output in outputs]
     assert scores[0] == scores[1], "all processes know the score"
     weights = tmp_path / "run" / "final.safetensors"
-    made, final = ddp_train.recipe(), load_weights(weights)
-    source = open_source(made.validation.source, data)
+    run_recipe, final = ddp_train.recipe(), load_weights(weights)
+    source = open_source(run_recipe.validation.source, data)
     logged = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     last = [line for line in logged if "validation/Car" in line][-1]
     assert last["step"] == 40
     assert last["validation/Car"] > 5
-    score = Validator(made.validation, source)(final)
+    score = Validator(run_recipe.validation, source)(final)
     assert score.value == pytest.approx(last["validation/Car"]), "one process scores the same in all frames"
     assert len(source) % 2, "shares of different lengths"
-    feeds = [feed_of(made, data, rank) for rank in (0, 1)]
+    feeds = [feed_of(run_recipe, data, rank) for rank in (0, 1)]
     for layer in batch_norms(final).values():
         assert layer.running_mean is not None
         layer.running_mean.fill_(9.0)
-    steps = [feed[step] for step in range(40) for feed in feeds]
+    steps = [dataset[step] for step in range(40) for dataset in feeds]
     measure_statistics(final, steps, lambda work: final(work.batch, work.grid))
     for name, value in load_weights(weights).state_dict().items():
         torch.testing.assert_close(value, final.state_dict()[name], rtol=1e-5, atol=1e-6, msg=name)
 
 
-def feed_of(made: Any, data: Path, rank: int) -> Feed:
+def feed_of(run_recipe: Any, data: Path, rank: int) -> TrainingDataset:
     """What a process of the run drew."""
-    config = build(made.detector.name, made.detector.options).config
-    change = Change(made.augment, ObjectDatabase.load(data.parent / "run" / "objects.npz"), made.seed)
-    source = MixedSource([open_source(section, data) for section in made.data])
-    return Feed(source, change, config.classes, config.grid, made.optim.batch, rank=rank, world=2)
+    config = build(run_recipe.detector.name, run_recipe.detector.options).config
+    change = Augment(run_recipe.augment, ObjectDatabase.load(data.parent / "run" / "objects.npz"), run_recipe.seed)
+    source = MixedSource([open_source(section, data) for section in run_recipe.data])
+    return TrainingDataset(source, change, config.classes, config.grid, run_recipe.optim.batch, rank=rank, world=2)
 
 
 @pytest.mark.slow
@@ -110,9 +110,9 @@ def test_two_processes_equal_one_with_the_joint_batch(tmp_path: Path) -> None:
 
 
 def test_a_batch_that_cannot_be_shared_evenly_is_refused(tmp_path: Path) -> None:
-    feed = tiny_run(tmp_path).feed
+    dataset = tiny_run(tmp_path).dataset
     with pytest.raises(BeamboxError, match=r"optim\.batch = 2 frames cannot be shared evenly by 3 processes"):
-        type(feed)(feed.source, feed.change, feed.classes, feed.grid, 2, world=3)
+        type(dataset)(dataset.source, dataset.augment, dataset.classes, dataset.grid, 2, world=3)
 
 
 def test_the_documented_commands_fit_their_recipes() -> None:
@@ -123,5 +123,5 @@ def test_the_documented_commands_fit_their_recipes() -> None:
     commands = re.findall(r"torchrun --nproc-per-node (\d+) .* train (\S+)(.*)", text)
     assert len(commands) >= 2
     for processes, name, rest in commands:
-        made = read_recipe(name, re.findall(r"--set (\S+)", rest))
-        check_recipe(made, build(made.detector.name, made.detector.options).config, int(processes))
+        run_recipe = read_recipe(name, re.findall(r"--set (\S+)", rest))
+        check_recipe(run_recipe, build(run_recipe.detector.name, run_recipe.detector.options).config, int(processes))

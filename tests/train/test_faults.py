@@ -18,7 +18,7 @@ from beambox.detectors.weights import read_weights
 from beambox.train.checkpoint import load_checkpoint
 from beambox.train.config import apply_overrides, parse_recipe
 from beambox.train.folder import LAST, PREVIOUS, locked
-from beambox.train.log import Clock, RunLog
+from beambox.train.log import RunLog, Timer
 from beambox.train.loop import train
 from beambox.train.run import Run
 from beambox.train.validate import Score, Validator
@@ -64,14 +64,14 @@ def test_a_gradient_that_is_not_finite_changes_no_weight(
     clip: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tiny_run(tmp_path, recipe(clip=clip))
-    run.advance(run.feed[0], Clock())
+    run.train_step(run.dataset[0], Timer())
     before = {name: value.clone() for name, value in run.detector.named_parameters()}
     averaged = {name: value.clone() for name, value in run.result.named_parameters()}
     loss = run.detector.loss
     poisoned = lambda *given: {name: Poisoned.apply(value) for name, value in loss(*given).items()}
     monkeypatch.setattr(run.detector, "loss", poisoned)
     with pytest.raises(BeamboxError, match=r"the gradient is not finite at step 1 \(cls [\d.]+, .*, of .* on frames 0"):
-        run.advance(run.feed[1], Clock())
+        run.train_step(run.dataset[1], Timer())
     assert run.step == 1
     assert all(torch.equal(before[name], value) for name, value in run.detector.named_parameters())
     assert all(torch.equal(averaged[name], value) for name, value in run.result.named_parameters())
@@ -82,7 +82,7 @@ def test_one_older_checkpoint_is_kept_and_serves_where_the_last_is_damaged(tmp_p
     run.save()
     assert not (tmp_path / PREVIOUS).exists()
     for step in range(2):
-        run.advance(run.feed[step], Clock())
+        run.train_step(run.dataset[step], Timer())
         run.save()
     assert [load_checkpoint(tmp_path / name).step for name in (PREVIOUS, LAST)] == [1, 2]
     (tmp_path / LAST).write_bytes((tmp_path / LAST).read_bytes()[:-1000])
@@ -201,8 +201,8 @@ def test_the_order_of_sampled_classes_is_kept(data: Path, tmp_path: Path) -> Non
     sample = {"Pedestrian": 1, "Car": 2, "Cyclist": 3}
     values = apply_overrides({"augment": {"sample": sample}, "seed": 0}, ["seed=1"])
     assert list(values["augment"]["sample"]) == list(sample)
-    made = whole_recipe(augment={"sample": sample}, validation=None)
-    outcome = train(made, data, tmp_path / "run")
+    run_recipe = whole_recipe(augment={"sample": sample}, validation=None)
+    outcome = train(run_recipe, data, tmp_path / "run")
     assert outcome.weights is not None
     card = read_weights(outcome.weights).card["recipe"]
     assert list(card["augment"]["sample"]) == list(sample)
@@ -225,7 +225,7 @@ def test_no_two_random_streams_of_a_run_are_one(monkeypatch: pytest.MonkeyPatch)
     import numpy as np
 
     from beambox.data.mixture import MixedSource
-    from beambox.data.walk import _permutation
+    from beambox.data.sampling import _permutation
     from oracles.tiny_training import frames
 
     mixture = MixedSource([frames(3), frames(4), frames(2)])
@@ -234,7 +234,7 @@ def test_no_two_random_streams_of_a_run_are_one(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(np.random, "default_rng", lambda key: (keys.add(tuple(key)), make(key))[1])
     _permutation.cache_clear()
     for epoch in range(4):
-        mixture.order(0, epoch)
+        mixture.epoch_indices(0, epoch)
     stripped = [tuple(np.trim_zeros(key, "b")) for key in keys]
     assert len(keys) > 10
     assert len(set(stripped)) == len(stripped)

@@ -3,9 +3,9 @@ import re
 import pytest
 import torch
 
-from beambox.detectors.catalogue import config_from_dict
-from beambox.detectors.kassd import KassdConfig, Neck
-from beambox.detectors.second import SecondConfig
+from beambox.detectors.catalog import config_from_dict
+from beambox.detectors.kassd import KASSDConfig, Neck
+from beambox.detectors.second import SECONDConfig
 from beambox.infer.evaluate import score_frames
 from beambox.metrics.kitti import KittiFrame
 from beambox.simulate.frames import CAMERA
@@ -14,18 +14,18 @@ from beambox.structures.labels import ImageAttributes
 from beambox.train.ablation import row_recipe, value_at
 from beambox.train.config import ValidationSection, read_recipe
 from beambox.train.tables import Table, table_of
-from beambox.train.validate import summarise
+from beambox.train.validate import summarize
 
 
-def configs(table: Table) -> dict[str, KassdConfig]:
+def configs(table: Table) -> dict[str, KASSDConfig]:
     recipe = read_recipe(table.recipe)
-    made = {}
+    by_row = {}
     for row in table.rows:
         assert row.options is not None
         plan = row_recipe(recipe, row.options, 0)
         assert plan.detector.name == "kassd"
-        made[row.name] = config_from_dict(KassdConfig, plan.detector.options)
-    return made
+        by_row[row.name] = config_from_dict(KASSDConfig, plan.detector.options)
+    return by_row
 
 
 def test_table_6_counts_the_keypoints_its_rows_name() -> None:
@@ -44,7 +44,7 @@ def test_tables_4_and_5_switch_what_their_rows_name() -> None:
         "KAM": (False, True),
         "LLM + KAM": (True, True),
     }
-    assert four["LLM + KAM"] == KassdConfig(), "the recipe spells out the defaults"
+    assert four["LLM + KAM"] == KASSDConfig(), "the recipe spells out the defaults"
     five = configs(table_of("kassd-table5"))
     assert [c.neck for c in five.values()] == [Neck.PSA, Neck.DENSEASPP, Neck.SPP, Neck.LLM]
     assert all(c.kam for c in five.values())
@@ -64,7 +64,7 @@ def test_table_3_compares_with_second_as_it_is_trained() -> None:
     weights = table["SECOND"].loss_weights
     assert (weights.cls, weights.loc, weights.direction) == (1.0, 2.0, 0.2)
     assert not table["SECOND"].llm and not table["SECOND"].kam
-    second = config_from_dict(SecondConfig, of_second.detector.options)
+    second = config_from_dict(SECONDConfig, of_second.detector.options)
     assert (second.grid, second.anchors) == (table["SECOND"].grid, table["SECOND"].anchors)
 
 
@@ -89,4 +89,4 @@ def test_without_levels_every_object_counts(occluded: list[KittiFrame]) -> None:
     graded = score_frames(occluded, ("Car",))
     assert graded["Car"].objects == (0, 0, 0)
     section: ValidationSection = recipe.validation.model_copy(update={"recalls": "all"})
-    assert summarise(scores, section).value == pytest.approx(100)
+    assert summarize(scores, section).value == pytest.approx(100)

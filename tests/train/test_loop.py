@@ -12,18 +12,18 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.detectors.weights import load_weights
-from beambox.train.feed import TrainingBatch
-from beambox.train.log import Clock, RunLog
+from beambox.train.dataset import TrainingBatch
+from beambox.train.log import RunLog, Timer
 from beambox.train.loop import Run
 from oracles.tiny_training import recipe, tiny_run
 
 
-def go(run: Run, until: int) -> list[float]:
+def train_until(run: Run, until: int) -> list[float]:
     """Train up to a step; returns the total losses."""
     run.module.train()
     totals = []
     while run.step < until:
-        losses, _ = run.advance(run.feed[run.step], Clock())
+        losses, _ = run.train_step(run.dataset[run.step], Timer())
         totals.append(losses["total"].item())
     return totals
 
@@ -35,9 +35,9 @@ def state(run: Run) -> dict[str, torch.Tensor]:
 
 def test_resumed_run_equals_uninterrupted_one_bit_by_bit(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole")
-    losses = go(whole, 6)
+    losses = train_until(whole, 6)
     first = tiny_run(tmp_path / "cut")
-    go(first, 3)
+    train_until(first, 3)
     first.save()
     second = tiny_run(tmp_path / "cut", recipe(), count=5)
     with torch.no_grad():
@@ -45,20 +45,20 @@ def test_resumed_run_equals_uninterrupted_one_bit_by_bit(tmp_path: Path) -> None
             parameter.add_(1.0)  # nothing of the fresh weights may survive
     second.restore()
     assert second.step == 3
-    assert go(second, 6) == losses[3:]
+    assert train_until(second, 6) == losses[3:]
     for name, value in state(whole).items():
         assert torch.equal(value, state(second)[name]), name
 
 
 def test_loss_falls_on_one_frame(tmp_path: Path) -> None:
     run = tiny_run(tmp_path, recipe(iterations=60, batch=1, lr=0.01), count=1, window=None)
-    losses = go(run, 60)
+    losses = train_until(run, 60)
     assert sum(losses[-5:]) < 0.4 * sum(losses[:5])
 
 
 def test_loop_writes_log_checkpoint_and_loadable_weights(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made = recipe().model_copy(update={"log_every": 2, "save_every": 4})
-    run = tiny_run(tmp_path, made)
+    run_recipe = recipe().model_copy(update={"log_every": 2, "save_every": 4})
+    run = tiny_run(tmp_path, run_recipe)
     log = RunLog(tmp_path, run.total, 0, tensorboard=False)
     assert run.loop(log)
     log.close()
@@ -75,8 +75,8 @@ def test_loop_writes_log_checkpoint_and_loadable_weights(tmp_path: Path, capsys:
 
 
 def test_signal_stops_after_the_step_and_resuming_goes_on(tmp_path: Path) -> None:
-    made = recipe().model_copy(update={"log_every": 1})
-    run = tiny_run(tmp_path, made)
+    run_recipe = recipe().model_copy(update={"log_every": 1})
+    run = tiny_run(tmp_path, run_recipe)
 
     class Interrupting(RunLog):
         def progress(self, step: int) -> None:
@@ -94,7 +94,7 @@ def test_loss_that_is_not_finite_stops_and_shows_its_parts(tmp_path: Path) -> No
     with torch.no_grad():
         run.detector.head.cls.bias.fill_(float("nan"))
     with pytest.raises(BeamboxError, match=r"loss is not finite at step 0 \(cls nan, loc .*\) on frames 0"):
-        go(run, 1)
+        train_until(run, 1)
 
 
 def test_batch_without_objects_trains(tmp_path: Path) -> None:
@@ -103,9 +103,9 @@ def test_batch_without_objects_trains(tmp_path: Path) -> None:
     from beambox.structures import Labels
 
     run = tiny_run(tmp_path)
-    work = run.feed[0]
+    work = run.dataset[0]
     empty = TrainingBatch(replace(work.batch, labels=(Labels.empty(),) * 2), work.grid)
-    losses, _ = run.advance(empty, Clock())
+    losses, _ = run.train_step(empty, Timer())
     assert torch.isfinite(losses["total"])
 
 

@@ -15,7 +15,7 @@ import yaml
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameList
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.structures import Frame, Labels
 from beambox.train import loop
 from beambox.train.config import parse_recipe
@@ -24,7 +24,13 @@ from beambox.train.preflight import check_labels, check_recipe
 from oracles.command_line import beambox
 from oracles.tiny_training import OPTIONS, frames, tiny_kitti
 
-FORKLIFT = {"name": "Forklift", "size": [3.9, 1.6, 1.5], "bottom": -1.73, "matched": 0.5, "unmatched": 0.35}
+FORKLIFT = {
+    "name": "Forklift",
+    "size": [3.9, 1.6, 1.5],
+    "bottom_z": -1.73,
+    "matched_threshold": 0.5,
+    "unmatched_threshold": 0.35,
+}
 CONFIG = build("pointpillars", OPTIONS).config
 
 
@@ -47,11 +53,11 @@ def recipe(**changes: Any) -> Any:
 
 def changed(edit: Callable[[Labels], Labels]) -> FrameList:
     """Five frames with their labels edited."""
-    made = []
+    edited = []
     for frame in frames(5).frames:
         assert frame.labels is not None
-        made.append(replace(frame, labels=edit(frame.labels)))
-    return FrameList(made)
+        edited.append(replace(frame, labels=edit(frame.labels)))
+    return FrameList(edited)
 
 
 def sized(labels: Labels, length: float) -> Labels:
@@ -87,17 +93,17 @@ def test_labels_from_which_nothing_can_be_learnt(edit: Callable[[Labels], Labels
 def test_one_good_frame_among_many_is_enough_and_lacking_classes_are_told() -> None:
     source = changed(lambda labels: labels).frames
     empty = [replace(frame, labels=Labels.empty()) for frame in source] * 10
-    told: list[str] = []
-    check_labels(FrameList([*empty, source[0]]), "training data", CONFIG.classes, CONFIG.grid, told.append)
-    assert len(told) == 1
+    messages: list[str] = []
+    check_labels(FrameList([*empty, source[0]]), "training data", CONFIG.classes, CONFIG.grid, messages.append)
+    assert len(messages) == 1
     assert re.match(
-        r"note: no Pedestrian, Cyclist in the \d+ frames of the training data looked at; they hold 1 Car", told[0]
+        r"note: no Pedestrian, Cyclist in the \d+ frames of the training data looked at; they hold 1 Car", messages[0]
     )
     with pytest.raises(BeamboxError, match="the validation data hold no frame"):
-        check_labels(FrameList([]), "validation data", CONFIG.classes, CONFIG.grid, told.append)
+        check_labels(FrameList([]), "validation data", CONFIG.classes, CONFIG.grid, messages.append)
     bare = FrameList([Frame(source[0].points, "a")])
     with pytest.raises(BeamboxError, match="frame a of the training data has no labels"):
-        check_labels(bare, "training data", CONFIG.classes, CONFIG.grid, told.append)
+        check_labels(bare, "training data", CONFIG.classes, CONFIG.grid, messages.append)
 
 
 def own_class(**validation: Any) -> dict[str, Any]:
@@ -129,9 +135,9 @@ def own_class(**validation: Any) -> dict[str, Any]:
     ],
 )
 def test_recipes_that_would_fail_late(changes: dict[str, Any], message: str) -> None:
-    made = recipe(**changes)
+    edited = recipe(**changes)
     with pytest.raises(BeamboxError, match=message):
-        check_recipe(made, build(made.detector.name, made.detector.options).config, 1)
+        check_recipe(edited, build(edited.detector.name, edited.detector.options).config, 1)
     with pytest.raises(BeamboxError, match=r"batch = 2 frames cannot be shared evenly by 8 .*--set optim.batch=8"):
         check_recipe(recipe(), CONFIG, 8)
     check_recipe(
@@ -157,9 +163,9 @@ def test_recipes_that_ship_pass_and_those_of_publications_say_float32() -> None:
     listed = list_recipes()
     assert len(listed) > 30
     for entry in listed:
-        for made in read_stages(entry.path):
-            check_recipe(made, build(made.detector.name, made.detector.options).config, 1)
-            assert made.precision == "float32" or entry.audience != "published", entry.name
+        for edited in read_stages(entry.path):
+            check_recipe(edited, build(edited.detector.name, edited.detector.options).config, 1)
+            assert edited.precision == "float32" or entry.audience != "published", entry.name
 
 
 def test_data_of_ones_own_are_given_by_their_yaml_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,8 +179,8 @@ def test_data_of_ones_own_are_given_by_their_yaml_file(tmp_path: Path, capsys: p
         (own.parent / "labels" / f"{frame.id}.json").write_text(json.dumps([box]))
     own.write_text("points: velodyne/{frame}.bin\nlabels: labels/{frame}.json\nformat: json\nclasses: [Car]\n")
     source = {"kind": "custom", "path": "{data}", "split": "all"}
-    made = recipe(data=[source], augment=None, validation=None, optim={"iterations": 1, "batch": 2})
-    (tmp_path / "r.yaml").write_text(yaml.safe_dump(made.model_dump(mode="json")))
+    edited = recipe(data=[source], augment=None, validation=None, optim={"iterations": 1, "batch": 2})
+    (tmp_path / "r.yaml").write_text(yaml.safe_dump(edited.model_dump(mode="json")))
     ran = beambox(capsys, "train", tmp_path / "r.yaml", "--data", own, "--out", tmp_path / "run")
     assert ran.status == 0, ran.err
     assert (tmp_path / "run" / "final.safetensors").is_file()

@@ -9,14 +9,20 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.detectors.weights import read_weights, save_weights
 from beambox.train.config import DetectorSection
 from beambox.train.start import build_detector
 from beambox.zoo import shipped
 from oracles.tiny_training import OPTIONS
 
-FORKLIFT = {"name": "Forklift", "size": [3.0, 1.5, 2.0], "bottom": -1.73, "matched": 0.5, "unmatched": 0.35}
+FORKLIFT = {
+    "name": "Forklift",
+    "size": [3.0, 1.5, 2.0],
+    "bottom_z": -1.73,
+    "matched_threshold": 0.5,
+    "unmatched_threshold": 0.35,
+}
 
 
 def start(weights: object, **options: Any) -> tuple[Any, list[str]]:

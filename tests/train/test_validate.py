@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.detectors.weights import read_weights
 from beambox.layers.anchors import KITTI_ANCHORS
 from beambox.metrics.once_result import OnceResult
@@ -18,7 +18,7 @@ from beambox.simulate import Sensor, write_dataset
 from beambox.train.config import Recipe, ValidationSection, parse_recipe, read_recipe
 from beambox.train.loop import train
 from beambox.train.sources import open_source
-from beambox.train.validate import Validator, summarise_once
+from beambox.train.validate import Validator, summarize_once
 from oracles.command_line import beambox
 from oracles.tiny_training import OPTIONS
 
@@ -84,7 +84,7 @@ def test_the_wanted_class_at_all_distances_chooses() -> None:
     result = OnceResult(("Vehicle", "Pedestrian", "Cyclist"), (0.7, 0.3, 0.5), rows, ((1,) * 4,) * 3, 1)
     for name, value in (("mean", 30.0), ("Vehicle", 40.0), ("Cyclist", 30.0)):
         section = ValidationSection.model_validate({"source": SOURCE, "choose_by": name})
-        score = summarise_once(result, section)
+        score = summarize_once(result, section)
         assert score.value == pytest.approx(value)
     assert score.text == "ONCE AP overall Vehicle 40.00, Pedestrian 20.00, Cyclist 30.00, mean 30.00"
     assert score.table["Vehicle"]["30-50m"] == 2.0
@@ -102,12 +102,12 @@ def test_perfect_detections_score_100(data: Path) -> None:
         classes = tuple(dict.fromkeys(labels.names))
         index = torch.tensor([classes.index(name) for name in labels.names])
         found.append((frame, Detections(labels.boxes, torch.ones(len(labels)), index, classes, frame.id)))
-    score = summarise_once(score_once(scored_frames(found)), recipe().validation)
+    score = summarize_once(score_once(scored_frames(found)), recipe().validation)
     assert score.scalars["Vehicle"] == pytest.approx(100)
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "pattern"),
     [
         (
             {"recalls": "all"},
@@ -121,15 +121,15 @@ def test_perfect_detections_score_100(data: Path) -> None:
         ({"iou": {"Cyclists": 0.5}}, r"`iou`: ONCE's metric has no class 'Cyclists' \(did you mean \"Cyclist\"\?\)"),
     ],
 )
-def test_options_of_the_other_metric_are_refused(given: dict[str, Any], told: str) -> None:
-    with pytest.raises(BeamboxError, match=told):
+def test_options_of_the_other_metric_are_refused(given: dict[str, Any], pattern: str) -> None:
+    with pytest.raises(BeamboxError, match=pattern):
         recipe(**given)
 
 
 def test_a_recipe_written_down_can_be_read_again() -> None:
-    made = recipe(choose_by="Pedestrian", iou={"Vehicle": 0.5})
-    assert parse_recipe(made.model_dump(mode="json")) == made
-    assert isinstance(Validator(made.validation, []), Validator)
+    run_recipe = recipe(choose_by="Pedestrian", iou={"Vehicle": 0.5})
+    assert parse_recipe(run_recipe.model_dump(mode="json")) == run_recipe
+    assert isinstance(Validator(run_recipe.validation, []), Validator)
 
 
 @pytest.mark.slow
@@ -148,8 +148,8 @@ def test_recipes_for_once_train_on_simulated_data(
 ) -> None:
     grid = f"{{minimum: [-12.8, -12.8, -5.0], maximum: [12.8, 12.8, 3.0], cell: {cell}}}"
     changes = ["optim.iterations=2", "optim.epochs=null", "optim.batch=1", "workers=0", f"detector.options.grid={grid}"]
-    made = read_recipe(name, changes)
-    assert train(made, data, tmp_path / "run").finished
+    run_recipe = read_recipe(name, changes)
+    assert train(run_recipe, data, tmp_path / "run").finished
     assert "ONCE AP overall Vehicle" in capsys.readouterr().out
     ran = beambox(capsys, "evaluate", str(tmp_path / "run"), "--data", str(data), "--published")
     assert ran.status == 0

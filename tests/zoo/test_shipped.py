@@ -32,7 +32,7 @@ def test_a_card_stands_beside_the_weights_and_inside_them(name: str) -> None:
     path = shipped()[name]
     beside = yaml.safe_load(path.with_suffix(".yaml").read_text(encoding="utf-8"))
     inside = read_card(path)
-    assert inside.said == beside
+    assert inside.entries == beside
     for key in ("summary", "licence", "trained on", "recipe", "scores"):
         assert beside.get(key), f"the card of {name} must say `{key}`"
     assert find_recipe(beside["recipe"]).stem == name
@@ -68,9 +68,9 @@ def test_weights_that_are_not_free_say_so_once(name: str, caplog: pytest.LogCapt
 
 
 def test_the_default_is_free_and_every_weight_file_stands_in_the_notice() -> None:
-    assert read_card(shipped()[DEFAULT]).said["licence"] == "Apache-2.0"
+    assert read_card(shipped()[DEFAULT]).entries["licence"] == "Apache-2.0"
     notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
     for name, path in shipped().items():
-        paid = read_card(path).said["licence"] != "Apache-2.0"
+        paid = read_card(path).entries["licence"] != "Apache-2.0"
         assert (f"src/beambox/zoo/{name}.safetensors" in notice) == paid
         assert name in notice

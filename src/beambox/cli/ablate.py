@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from beambox.checks import BeamboxError, MissingFileError
+from beambox.checks import BeamboxError
 
 __all__ = ["command"]
 
@@ -35,6 +35,7 @@ def command(
     All rows share one recipe and one list of seeds and differ in their switches alone. Interrupted, the same command
     goes on where it stopped.
     """
+    from beambox.data.existence import expect_data
     from beambox.train.table_file import read_table
     from beambox.train.tables import table_of
 
@@ -47,11 +48,9 @@ def command(
         print(report(chosen, {}), end="")
         return
     wanted = parse_seeds(seeds)
-    if data is not None and not data.exists():
-        kind = "file" if data.suffix in (".yaml", ".yml") else "folder"
-        raise MissingFileError(f"--data: there is no {kind} {data}")
+    expect_data(data)
 
-    from beambox.cli.console import say
+    from beambox.cli.console import log
     from beambox.train.ablation import Interrupted, report, run_table, to_json
     from beambox.train.config import read_recipe
 
@@ -60,18 +59,18 @@ def command(
         changes += [f"optim.iterations={iterations}", "optim.epochs=null"]
     read = read_recipe(recipe or chosen.recipe, changes)
     try:
-        measured = run_table(chosen, read, data, out, wanted, say)
+        measured = run_table(chosen, read, data, out, wanted, log)
     except Interrupted:
         raise typer.Exit(130) from None
     optim = read.optim
     length = f"{optim.iterations} steps" if optim.iterations else f"{optim.epochs:g} epochs"
     assert read.validation is not None
     overlaps = "".join(f", {name} at IoU {iou:g}" for name, iou in read.validation.iou.items())
-    told = (
+    details = (
         f"recipe {read.name}, {length}, batch {optim.batch}, seeds {seeds}; "
         f"scored on `{read.validation.source.split}`{overlaps}"
     )
-    print(report(chosen, measured, told), end="")
+    print(report(chosen, measured, details), end="")
     if json_file is not None:
         from beambox.io import write_json
 

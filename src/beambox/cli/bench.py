@@ -10,7 +10,7 @@ import typer
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.cli import options
-from beambox.cli.console import announce, say, show_log
+from beambox.cli.console import announce, log, show_log
 
 __all__ = ["command"]
 
@@ -44,6 +44,10 @@ def command(
       beambox bench pointpillars-sim --protocol kassd
       beambox bench kassd --config --protocol kassd
     """
+    options.expect_there(inputs or [], "" if config else model)
+    if protocol not in ("stages", "kassd"):
+        raise BeamboxError(f'unknown protocol "{protocol}"{did_you_mean(protocol, ["stages", "kassd"])}')
+
     import json
     import tempfile
 
@@ -55,8 +59,6 @@ def command(
     from beambox.io import write_text
 
     show_log()
-    if protocol not in ("stages", "kassd"):
-        raise BeamboxError(f'unknown protocol "{protocol}"{did_you_mean(protocol, ["stages", "kassd"])}')
     if threads:
         torch.set_num_threads(threads)
     if config and range_:
@@ -71,17 +73,17 @@ def command(
         if protocol == "kassd":
             runs, batch = 10, 1
         report = measure(detector, paths, runs=runs, warmup=warmup, batch=batch, name=model)
-    told = report.setting
+    settings = report.setting
     print(
-        f"{model} on {told['device']}, {told['precision']}, {told['threads']} threads, batch {told['batch']}, "
-        f"{told['points']:,} points, {told['runs']} runs after {told['warmup']}"
+        f"{model} on {settings['device']}, {settings['precision']}, {settings['threads']} threads, "
+        f"batch {settings['batch']}, {settings['points']:,} points, {settings['runs']} runs after {settings['warmup']}"
     )
     if config:
         print("untrained weights: hardly any box is found, so post-processing is shorter than it will be")
     print(report.kassd_table() if protocol == "kassd" else report.table())
-    load_average, cores = told["load_average"], os.cpu_count() or 1
+    load_average, cores = settings["load_average"], os.cpu_count() or 1
     if load_average is not None and load_average > 0.5 * cores:
-        say(f"the machine was busy (load {load_average} on {cores} cores): these times are too long")
+        log(f"the machine was busy (load {load_average} on {cores} cores): these times are too long")
     if json_file is not None:
         write_text(json_file, json.dumps(report.to_json(), indent=2) + "\n")
 

@@ -11,7 +11,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "simulate a few sweeps, detect, score, draw: under a minute, nothing else needed",
     ),
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
-    "show": ("beambox.cli.show:command", "draw sweeps from above, with boxes, and the boxes into the camera image"),
+    "show": ("beambox.cli.show:command", "draw sweeps in BEV, with boxes, and the boxes into the camera image"),
     "stream": ("beambox.cli.stream:command", "detect and track through a recording; boxes as a recording"),
     "track": ("beambox.cli.track:command", "follow objects through a drive: identities, velocities"),
     "view": ("beambox.cli.view:command", "sweeps, boxes and cameras in the rerun viewer, live or as a file"),

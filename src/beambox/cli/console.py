@@ -12,7 +12,7 @@ from beambox import __version__
 from beambox.checks import printable
 from beambox.progress import track as progress
 
-__all__ = ["LONGEST_LINE", "announce", "plain", "plain_output", "progress", "say", "show_log"]
+__all__ = ["LONGEST_LINE", "announce", "log", "plain", "plain_output", "progress", "show_log"]
 
 LONGEST_LINE = 2000
 """Characters of a message; a file can hold a name of any length."""
@@ -33,7 +33,7 @@ def plain(text: str, encoding: str | None, limit: int | None = None) -> str:
     return shown.translate(BARS).encode(known, "backslashreplace").decode(known)
 
 
-def say(message: str) -> None:
+def log(message: str) -> None:
     """Print a line for the person at the terminal, on stderr, so that results can be piped."""
     print(plain(message, sys.stderr.encoding, LONGEST_LINE), file=sys.stderr)
 
@@ -70,7 +70,7 @@ def announce(command: str, *, seed: int | None = None, detail: str = "") -> None
     parts = [f"beambox {__version__} {command}"]
     parts += [f"seed {seed}"] if seed is not None else []
     parts += [detail] if detail else []
-    say(", ".join(parts))
+    log(", ".join(parts))
 
 
 def show_log(level: int = logging.WARNING) -> None:
@@ -86,4 +86,4 @@ class _Lines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a record."""
-        say(f"beambox: {record.getMessage()}")
+        log(f"beambox: {record.getMessage()}")

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from beambox.cli.main import guard, help_of
+from beambox.cli.options import expect_there
 
 __all__ = ["app"]
 
@@ -37,18 +38,19 @@ def check(
       beambox data check data.yaml
       beambox data check kitti --split train --frames 200
     """
+    expect_there([data])
     import json
 
     from beambox.checks import BeamboxError
     from beambox.cli.console import progress
-    from beambox.data.check_text import report_json, report_text
     from beambox.data.checking import check_frames
     from beambox.data.custom import CustomSource
     from beambox.data.custom_config import KITTI_GROUND
-    from beambox.data.opening import open_data
+    from beambox.data.format_report import format_report, report_json
+    from beambox.data.open_dataset import open_dataset
     from beambox.io import write_text
 
-    source = open_data(data, split)
+    source = open_dataset(data, split)
     limits, ground = None, None
     if isinstance(source, CustomSource):
         source = CustomSource(data, split, whole=True)
@@ -56,7 +58,7 @@ def check(
         ground = None if source.config.sensor_height is None else KITTI_GROUND
     chosen = spread(len(source), frames)
     report = check_frames(source, progress(chosen, len(chosen), "reading"), limits)
-    print(report_text(report, ground), end="")
+    print(format_report(report, ground), end="")
     if json_file is not None:
         write_text(json_file, json.dumps(report_json(report, ground), indent=1, allow_nan=False) + "\n")
     if report.unreadable:
@@ -69,12 +71,13 @@ def anchors(data: DATA, split: SPLIT = "all", frames: FRAMES = None) -> None:
     Examples:
       beambox data anchors data.yaml --split train
     """
+    expect_there([data])
     from beambox.checks import BeamboxError
     from beambox.cli.console import progress
     from beambox.data.anchor_sizes import proposals_text, propose_anchors
-    from beambox.data.opening import open_data
+    from beambox.data.open_dataset import open_dataset
 
-    source = open_data(data, split)
+    source = open_dataset(data, split)
     chosen = spread(len(source), frames)
     labels = (source[index].labels for index in progress(chosen, len(chosen), "reading"))
     proposals = propose_anchors(one for one in labels if one is not None)
@@ -95,17 +98,18 @@ def voxels(
     Examples:
       beambox data voxels once --split val --frames 100 --cell 0.1,0.1,0.2 --out figure2.png
     """
+    expect_there([data])
     from beambox.checks import BeamboxError
     from beambox.cli.console import progress
-    from beambox.data.opening import open_data
-    from beambox.visualise.canvas import save_picture
-    from beambox.visualise.voxel_histogram import draw_histogram, voxel_histogram
+    from beambox.data.open_dataset import open_dataset
+    from beambox.visualize.canvas import save_picture
+    from beambox.visualize.voxel_histogram import draw_histogram, voxel_histogram
 
     try:
         x, y, z = (float(word) for word in cell.split(","))
     except ValueError:
         raise BeamboxError(f'--cell takes three lengths in metres, as 0.1,0.1,0.15; got "{cell}"') from None
-    source = open_data(data, split)
+    source = open_dataset(data, split)
     chosen = spread(len(source), frames)
     sweeps = (source[index] for index in progress(chosen, len(chosen), "reading"))
     histogram = voxel_histogram(sweeps, (x, y, z))
@@ -123,6 +127,7 @@ def splits(
     Examples:
       beambox data splits kitti
     """
+    expect_there([folder])
     from beambox.data.kitti_splits import write_kitti_splits
 
     for name, count in write_kitti_splits(folder, partial=partial).items():
@@ -150,12 +155,13 @@ def convert(
     supervisely, datumaro (CVAT), segments, scale, openlabel, pandaset_columns, table (CSV with any usual names), kitti;
     read only: pandaset, once, csv, json (as `beambox detect` writes them).
     """
-    from beambox.cli.console import say
+    expect_there([source, calib])
+    from beambox.cli.console import log
     from beambox.data.labels.convert import convert_labels
 
     frames, notes = convert_labels(source, kind, out, wanted, calib=calib, degrees=degrees)
     for note in notes:
-        say(f"note: {note}")
+        log(f"note: {note}")
     print(f"{sum(map(len, frames.values()))} boxes of {len(frames)} frames -> {out}")
 
 

@@ -10,7 +10,7 @@ import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
-from beambox.cli.console import announce, say, show_log
+from beambox.cli.console import announce, log, show_log
 
 __all__ = ["command"]
 
@@ -40,9 +40,9 @@ def command(
         raise BeamboxError("no weights are shipped with this installation; train some and give them by --model")
     announce("demo", seed=seed, detail=name)
     detector = load(name, device=device)
-    done = run_demo(detector, out, frames=frames, seed=seed, sensor=sensor, model=name, tell=print)
+    done = run_demo(detector, out, frames=frames, seed=seed, sensor=sensor, model=name, log=print)
     print()
     print(short_table(done.scores))
     print()
     print(f"pictures: {done.pictures[0].parent}; whole table: {out / 'scores.txt'}; results: {out / 'results'}")
-    say(f"{done.objects} objects, {done.detections} found, {time.perf_counter() - start:.0f} s")
+    log(f"{done.objects} objects, {done.detections} found, {time.perf_counter() - start:.0f} s")

@@ -11,7 +11,7 @@ import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
-from beambox.cli.console import announce, progress, say, show_log
+from beambox.cli.console import announce, log, progress, show_log
 
 if TYPE_CHECKING:
     from beambox.infer.inputs import Sweep
@@ -36,7 +36,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     formats: Annotated[
         str, typer.Option("--format", "-f", metavar="F", help="json, csv, kitti, jsonl, parquet.")
     ] = "json",
-    min_score: options.MinScoreOption = 0.0,
+    score_threshold: options.ScoreThresholdOption = 0.0,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
     sensor_height: options.HeightOption = None,
@@ -50,7 +50,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     shard: Annotated[str, typer.Option(metavar="I/N", help="Do the I-th of N parts, as on machine I of N.")] = "1/1",
     workers: Annotated[int, typer.Option(min=1, max=1024, metavar="W", help="Processes, of one thread each.")] = 1,
 ) -> None:
-    """Find objects in sweeps; writes one result file a sweep.
+    """Find objects in sweeps; writes one result file per sweep.
 
     Examples:
       beambox detect scan.bin
@@ -62,14 +62,13 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     format needs the sweep's calibration, found as ../calib/ID.txt beside velodyne/ID.bin. Nothing found at all?
     `beambox doctor scan.bin --model M` says why.
     """
-    from beambox.data.existence import expect_inputs
     from beambox.zoo import DEFAULT
 
-    expect_inputs(inputs)  # before torch is loaded, which takes seconds
+    options.expect_there(inputs, model)
     parsed_range, slope = options.parse_range(range_), options.parse_slope(ground_slope)
     if not model:
         model = DEFAULT
-        say(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
+        log(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
 
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.jobs import TABLES, Job, choose_kinds, parse_shard
@@ -92,12 +91,12 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         "fields": fields or None,
     }
     if skip_existing or workers > 1 or part != (0, 1) or set(kinds) & set(TABLES):
-        job = Job(model, chosen, out, kinds, min_score, part)
+        job = Job(model, chosen, out, kinds, score_threshold, part)
         detect_many(sweeps, job, workers, skip_existing)
         return
     detector = load(model, **chosen)
     announce("detect", detail=f"{model} on {detector.device} in {str(detector.dtype).removeprefix('torch.')}")
-    detect_all(detector, sweeps, out, kinds, model, min_score)
+    detect_all(detector, sweeps, out, kinds, model, score_threshold)
 
 
 def detect_many(sweeps: list[Sweep], job: Job, workers: int, skip_existing: bool) -> None:
@@ -109,9 +108,9 @@ def detect_many(sweeps: list[Sweep], job: Job, workers: int, skip_existing: bool
     tally = run_job(sweeps, job, workers, skip_existing=skip_existing)
     seconds = time.perf_counter() - start
     for fault in tally.faults:
-        say(f"beambox: skipped: {fault}")
+        log(f"beambox: skipped: {fault}")
     rate = tally.sweeps / seconds / workers if seconds else 0.0
-    say(
+    log(
         f"{tally.sweeps} sweeps, {tally.boxes} detections, {seconds:.1f} s, {rate:.2f} sweeps/s per worker -> {job.out}"
     )
     if tally.failed:
@@ -119,38 +118,38 @@ def detect_many(sweeps: list[Sweep], job: Job, workers: int, skip_existing: bool
 
 
 def detect_all(
-    detector: Detector, sweeps: list[Sweep], out: Path, kinds: list[str], model: str, min_score: float
+    detector: Detector, sweeps: list[Sweep], out: Path, kinds: list[str], model: str, score_threshold: float
 ) -> None:
     """Detect and write, sweep after sweep; one that cannot be read does not keep the others from being done."""
     from beambox.infer.results import write_results
 
-    start, failed, found, told = time.perf_counter(), 0, 0, False
+    start, failed, found, hinted = time.perf_counter(), 0, 0, False
     for sweep in progress(sweeps, len(sweeps), "Detecting"):
         try:
             frame = detector.read(sweep)
         except BeamboxError as error:
             if len(sweeps) == 1:
                 raise
-            say(f"beambox: skipped: {error}")
+            log(f"beambox: skipped: {error}")
             failed += 1
             continue
-        if detector.sees_camera_only(frame) and not told:
-            say("points outside the camera's view are left out (calib found; --view full keeps them)")
-            told = True
+        if detector.sees_camera_only(frame) and not hinted:
+            log("points outside the camera's view are left out (calib found; --view full keeps them)")
+            hinted = True
         for note in frame.notes:
-            say(f"{sweep.name}: {note}")
-        if not told and (hint := unseen(detector, frame)):
-            say(hint)
-            told = True
+            log(f"{sweep.name}: {note}")
+        if not hinted and (hint := unseen(detector, frame)):
+            log(hint)
+            hinted = True
         detections = detector.detect([frame])[0]
-        detections = detections.above(min_score)
+        detections = detections.above(score_threshold)
         written = write_results(out, frame, detections, kinds, model, sweep.name)
         found += len(detections)
         print(f"{sweep.name}: {counted(detections)} -> {', '.join(str(path) for path in written)}")
     seconds = time.perf_counter() - start
-    say(f"{len(sweeps) - failed} sweeps, {found} detections, {seconds:.1f} s")
+    log(f"{len(sweeps) - failed} sweeps, {found} detections, {seconds:.1f} s")
     if not found and not failed:
-        say(f"nothing found; `beambox doctor {sweeps[0].path} --model {model}` says why")
+        log(f"nothing found; `beambox doctor {sweeps[0].path} --model {model}` says why")
     if failed:
         raise BeamboxError(f"{failed} of {len(sweeps)} sweeps could not be read; the others are done")
 
@@ -165,11 +164,11 @@ def unseen(detector: Detector, frame: Frame) -> str:
     share = float(outside.sum()) / max(1, len(xy))
     if share < UNSEEN:
         return ""
-    told = (
+    message = (
         f"{share:.0%} of the points lie where the network does not look (x {low[0]:g} to {high[0]:g}, y {low[1]:g} to "
         f"{high[1]:g} m): --range 50 looks all around"
     )
-    return told + (", though these weights know only what lies there" if detector.config.absolute_xy else "")
+    return message + (", though these weights know only what lies there" if detector.config.absolute_xy else "")
 
 
 def counted(detections: Detections) -> str:

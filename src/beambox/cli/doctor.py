@@ -43,23 +43,23 @@ def command(
 
         report(environment())
         return
-    from beambox.data.existence import expect_inputs
-
-    expect_inputs(inputs)
+    options.expect_there(inputs, model)
 
     from beambox.detectors.pointpillars import KITTI_PILLARS
-    from beambox.infer.doctor import examine
+    from beambox.infer.doctor import diagnose
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
-    from beambox.infer.trained import Trained
+    from beambox.infer.sensor_profile import SensorProfile
     from beambox.zoo import DEFAULT, shipped
 
     name = model or (DEFAULT if DEFAULT in shipped() else "")
     detector = load(name, device=device, view="full", fields=fields or None) if name else None
-    trained = Trained(KITTI_PILLARS) if detector is None else Trained.of(detector.card, detector.grid)
+    sensor_profile = (
+        SensorProfile(KITTI_PILLARS) if detector is None else SensorProfile.of(detector.card, detector.grid)
+    )
     for sweep in find_sweeps(inputs):
         print(f"{sweep.path}, compared with {name or 'KITTI'}:")
-        diagnosis = examine(sweep.path, trained, fields or None)
+        diagnosis = diagnose(sweep.path, sensor_profile, fields or None)
         report(diagnosis.findings)
         if detector is not None:
             try_out(sweep.path, detector, diagnosis)
@@ -88,10 +88,10 @@ def try_out(path: Path, detector: Detector, diagnosis: Diagnosis) -> None:
 
     text = f"detections with a score of at least 0.3: {sure()} as given"
     if diagnosis.options:
-        before = detector.corrections, detector.intensity_scale
+        before = detector.alignment, detector.intensity_scale
         try:
-            detector.corrections, detector.intensity_scale = diagnosis.corrections, diagnosis.intensity_scale
+            detector.alignment, detector.intensity_scale = diagnosis.alignment, diagnosis.intensity_scale
             text += f", {sure()} with the options below"
         finally:
-            detector.corrections, detector.intensity_scale = before
+            detector.alignment, detector.intensity_scale = before
     report([Finding("trial", "note", text)])

@@ -15,7 +15,9 @@ from beambox.cli.options import (
     ModelArgument,
     PrecisionOption,
     RangeOption,
+    ScoreThresholdOption,
     ViewOption,
+    expect_there,
     parse_classes,
     parse_range,
 )
@@ -33,9 +35,9 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     classes: ClassesOption = "",
     iou: IouOption = None,
     no_difficulty: Annotated[
-        bool, typer.Option("--no-difficulty", help="Every object counts, one AP a class; 3d and bev only.")
+        bool, typer.Option("--no-difficulty", help="Every object counts, one AP per class; 3d and bev only.")
     ] = False,
-    score_threshold: Annotated[float, typer.Option(help="Drop detections with lower scores.")] = 0.0,
+    score_threshold: ScoreThresholdOption = 0.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the numbers here.")] = None,
     results: Annotated[Path | None, typer.Option(help="Write KITTI result files into this folder.")] = None,
     keep: Annotated[
@@ -60,6 +62,8 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     Data without a camera have no difficulty levels: every object counts, and each class has one AP. Data of one's own
     are looked at within the range that their YAML file names. After the AP follow the errors of the matched boxes.
     """
+    expect_there([data], model)
+
     from beambox.io import write_json
     from beambox.metrics.rounds import parse_rounds
     from beambox.verbs import evaluate, open_dataset

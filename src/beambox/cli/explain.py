@@ -17,7 +17,7 @@ def command(  # each is an option of the command line
     model: options.ModelArgument,
     inputs: options.InputsArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path("explained"),
-    min_score: options.MinScoreOption = 0.3,
+    score_threshold: options.ScoreThresholdOption = 0.3,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
     sensor_height: options.HeightOption = None,
@@ -33,14 +33,15 @@ def command(  # each is an option of the command line
     HCNet: the weights of height slices and channels. KASSD: the weights of places and the scores of keypoints. DenNet:
     the densities of voxels, and what the surest boxes attend to.
     """
-    from beambox.data.existence import expect_inputs
+    from beambox.checks import expect_library
 
-    expect_inputs(inputs)
+    expect_library("matplotlib", "plots", "drawing what a detector weighs")
+    options.expect_there(inputs, model)
 
     from beambox.explain.pictures import explain
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.predictor import load
-    from beambox.visualise.canvas import save_picture
+    from beambox.visualize.canvas import save_picture
 
     show_log()
     sweeps = find_sweeps(inputs)
@@ -55,7 +56,7 @@ def command(  # each is an option of the command line
         intensity_scale=intensity_scale,
     )
     for sweep in sweeps:
-        for one in explain(detector, detector.read(sweep), min_score):
+        for one in explain(detector, detector.read(sweep), score_threshold):
             path = out / f"{sweep.name}_{one.name}.png"
             save_picture(one.picture, path)
             print(f"{one.caption} -> {path}")

@@ -32,10 +32,12 @@ def command(
       beambox export pointpillars-kitti --out pointpillars.onnx
       beambox export run --out run.onnx --verify scan.bin --range 50
     """
+    options.expect_there([sweep or None], model)
+
     from beambox.export.onnx_check import TOLERANCE
     from beambox.infer.cards import read_card
-    from beambox.infer.predictor import find_weights
     from beambox.verbs import export
+    from beambox.zoo import find_weights
 
     show_log()
     announce("export", detail=model)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from beambox.cli.options import expect_there
+
 __all__ = ["command"]
 
 
@@ -20,6 +22,8 @@ def command(
     Reads tensors only, never code. The configuration is the toolbox's for KITTI (1 or 3 classes) or ONCE (5 classes),
     told from the head. A checkpoint that does not fit is refused with the names and shapes.
     """
+    expect_there([checkpoint])
+
     from beambox.detectors.weights import save_weights
     from beambox.export.openpcdet import import_checkpoint
 

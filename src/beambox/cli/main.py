@@ -82,9 +82,9 @@ def explain(error: OSError) -> str:
 
 def stop(message: str, status: int) -> NoReturn:
     """Print one line on stderr and leave."""
-    from beambox.cli.console import say
+    from beambox.cli.console import log
 
-    say("beambox: " + " ".join(message.split()))
+    log("beambox: " + " ".join(message.split()))
     raise SystemExit(status)
 
 

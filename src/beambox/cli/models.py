@@ -25,13 +25,15 @@ def command(
     """
     import json
 
-    from beambox.infer.cards import card_text, read_card
-    from beambox.infer.predictor import find_weights
-    from beambox.io import write_text
-    from beambox.zoo import shipped
+    from beambox.zoo import find_weights, shipped
 
-    if name:
-        print(card_text(read_card(find_weights(name))))
+    file = find_weights(name) if name else None
+
+    from beambox.infer.cards import card_text, read_card
+    from beambox.io import write_text
+
+    if file is not None:
+        print(card_text(read_card(file)))
         return
     cards = [read_card(path) for path in shipped().values()]
     if json_file is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -19,13 +20,14 @@ __all__ = [
     "InputsArgument",
     "IntensityOption",
     "IouOption",
-    "MinScoreOption",
     "ModelArgument",
     "ModelOption",
     "PrecisionOption",
     "RangeOption",
+    "ScoreThresholdOption",
     "SlopeOption",
     "ViewOption",
+    "expect_there",
     "parse_classes",
     "parse_range",
     "parse_slope",
@@ -74,7 +76,7 @@ SlopeOption = Annotated[
     typer.Option(
         "--ground-slope",
         metavar="F,L",
-        help="Rise of the ground forward and left, metres a metre: 0,-0.03.",
+        help="Rise of the ground forward and left, metres per metre: 0,-0.03.",
     ),
 ]
 IntensityOption = Annotated[
@@ -85,8 +87,8 @@ FieldsOption = Annotated[
     str,
     typer.Option(metavar="F", help="Columns of .bin and .npy files, such as x,y,z,intensity,ring; _ leaves one out."),
 ]
-MinScoreOption = Annotated[
-    float, typer.Option("--min-score", metavar="S", help="Leave out detections below this score.")
+ScoreThresholdOption = Annotated[
+    float, typer.Option("--score-threshold", metavar="S", help="Leave out detections below this score.")
 ]
 ClassesOption = Annotated[
     str, typer.Option("--classes", metavar="NAMES", help="Classes to score, as Car,Cyclist; by default the detector's.")
@@ -100,6 +102,24 @@ IouOption = Annotated[
     ),
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+
+
+def expect_there(inputs: Iterable[str | Path | None], model: str = "") -> None:
+    """Check that inputs and weights are there, before torch is imported, which takes seconds.
+
+    Args:
+        inputs: files, folders, patterns; None for what was not given.
+        model: shipped name, weight file or folder of a run; empty where none was given.
+
+    Raises:
+        BeamboxError: naming the first that is not there.
+    """
+    from beambox.data.existence import expect_inputs
+    from beambox.zoo import find_weights
+
+    expect_inputs(given for given in inputs if given is not None)
+    if model:
+        find_weights(model)
 
 
 def parse_classes(text: str) -> list[str]:

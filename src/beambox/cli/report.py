@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beambox.cli.options import DeviceOption, PrecisionOption, RangeOption, ViewOption, parse_range
+from beambox.cli.options import DeviceOption, PrecisionOption, RangeOption, ViewOption, expect_there, parse_range
 
 if TYPE_CHECKING:
     from beambox.data.source import FrameSource
@@ -51,7 +51,11 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
 
     A folder of results holds one file per frame: .json or .csv of `beambox detect`, or KITTI's .txt.
     """
-    from beambox.data.opening import open_data
+    expect_there([data])
+    for name in (given, against):
+        expect_there([], name if not Path(name).is_dir() else "")
+
+    from beambox.data.open_dataset import open_dataset
     from beambox.data.source import SubsetSource
     from beambox.report.build import Options, check_page, measured, write_page
     from beambox.report.tables import check_ending
@@ -59,7 +63,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     check_page(out)
     for path in numbers or ():
         check_ending(path)
-    source: FrameSource = open_data(data, split)
+    source: FrameSource = open_dataset(data, split)
     if frames:
         source = SubsetSource(source, range(min(frames, len(source))))
     options = Options(

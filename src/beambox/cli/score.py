@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from beambox.cli.main import guard, help_of
-from beambox.cli.options import IouOption, parse_classes
+from beambox.cli.options import IouOption, expect_there, parse_classes
 
 __all__ = ["app", "parse_overlaps"]
 
@@ -26,7 +26,7 @@ Json = Annotated[Path | None, typer.Option("--json", help="also write the number
 
 
 def parse_overlaps(text: str) -> dict[str, float]:
-    """Read overlaps written as ``Car=0.5,Pedestrian=0.25``, one a class."""
+    """Read overlaps written as ``Car=0.5,Pedestrian=0.25``, one per class."""
     from beambox.infer.evaluate import parse_overlaps as parse
 
     return parse([text])
@@ -44,8 +44,10 @@ def conclude(results: Sequence[Any], tables: Sequence[str], path: Path | None) -
 
 def kitti(
     labels: Annotated[Path, typer.Option(help="folder of label files (or the KITTI root above label_2)")],
-    results: Annotated[Path, typer.Option(help="folder of result files, one a frame; empty: nothing found")],
-    frames: Annotated[Path | None, typer.Option(help="file with one frame name a line; default: every label")] = None,
+    results: Annotated[Path, typer.Option(help="folder of result files, one per frame; empty: nothing found")],
+    frame_list: Annotated[
+        Path | None, typer.Option("--frame-list", help="file with one frame name per line; default: every label")
+    ] = None,
     classes: Annotated[str, typer.Option(help="classes to score, as Car,Cyclist")] = "Car,Pedestrian,Cyclist",
     iou: IouOption = None,
     no_difficulty: Annotated[
@@ -54,18 +56,22 @@ def kitti(
     python_port: Annotated[bool, typer.Option("--python-port", help="follow the Python port where it differs")] = False,
     allow_missing: Annotated[bool, typer.Option("--allow-missing", help="no result file means nothing found")] = False,
     json: Json = None,
+    frames: Annotated[Path | None, typer.Option(help="the former name of --frame-list", hidden=True)] = None,
 ) -> None:
     """Score KITTI result files as the official program does (needs no images, points or calibration).
 
     Examples:
-      beambox score kitti --labels kitti/training/label_2 --results out --frames kitti/ImageSets/val.txt
+      beambox score kitti --labels kitti/training/label_2 --results out --frame-list kitti/ImageSets/val.txt
       beambox score kitti --labels kitti --results out --classes Car --iou Car=0.5 --json ap.json
     """
+    listed = frame_list or frames
+    expect_there([labels, results, listed])
+
     from beambox.metrics.kitti import evaluate_files
     from beambox.metrics.kitti_objects import read_frame_list
     from beambox.metrics.rounds import parse_rounds, score_rounds
 
-    names = None if frames is None else read_frame_list(frames)
+    names = None if listed is None else read_frame_list(listed)
     results_of_rounds = score_rounds(
         lambda wanted, overlaps: evaluate_files(
             labels,
@@ -99,6 +105,8 @@ def once(
       beambox score once --annotations annotations.json
       beambox score once --annotations val.json --results predictions.json --published --json ap.json
     """
+    expect_there([annotations, results])
+
     from beambox.metrics.once import evaluate_annotations
     from beambox.metrics.rounds import parse_rounds, score_rounds
 
@@ -118,7 +126,7 @@ def once(
 
 
 def tracking(
-    labels: Annotated[Path, typer.Option(help="label file of a drive, or folder of label files, one a drive")],
+    labels: Annotated[Path, typer.Option(help="label file of a drive, or folder of label files, one per drive")],
     results: Annotated[Path, typer.Option(help="tracks of the drive, or folder of files with the labels' names")],
     calib: Annotated[Path, typer.Option(help="calib file, or folder of files with the labels' names")],
     classes: Annotated[str, typer.Option(help="classes to score, comma-separated")] = "Car,Pedestrian,Cyclist",
@@ -132,6 +140,8 @@ def tracking(
       beambox score tracking --labels label_02/0012.txt --results tracks.txt --calib calib/0012.txt
       beambox score tracking --labels label_02 --results out --calib calib --classes Car --overlap 2d
     """
+    expect_there([labels, results, calib])
+
     from beambox.track.scoring import read_drives, score_tracks
 
     result = score_tracks(

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from beambox.geometry.axes import Axes
     from beambox.infer.predictor import Detector
     from beambox.structures import Detections, Frame, Labels
-    from beambox.visualise.bev import Region
-    from beambox.visualise.scene import Scene
+    from beambox.visualize.bev import Region
+    from beambox.visualize.scene import Scene
 
 __all__ = ["command"]
 
@@ -44,13 +44,13 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         Path | None, typer.Option(metavar="DIR", help="Draw these detections (json, csv, KITTI).")
     ] = None,
     labels: Annotated[str, typer.Option(metavar="DIR", help="Ground truth in KITTI's format; none draws none.")] = "",
-    colour: Annotated[str, typer.Option(help="Points by height or intensity.")] = "height",
+    color: Annotated[str, typer.Option(help="Points by height or intensity.")] = "height",
     area: Annotated[str, typer.Option(metavar="A", help="What to show: 40 for 40 m all around, or x0,y0,x1,y1.")] = "",
     split: Annotated[str, typer.Option(help="Of a data set: the list of frames; all of them where not given.")] = "",
-    frame: Annotated[str, typer.Option(metavar="NAMES", help="Only the sweeps of these names, as 000001,000004.")] = "",
+    names: Annotated[str, typer.Option(metavar="NAMES", help="Only the sweeps of these names, as 000001,000004.")] = "",
     frames: Annotated[int, typer.Option(min=0, help="Only the first so many sweeps; 0: all.")] = 0,
     rate: Annotated[float, typer.Option(help="Sweeps per second of films and of a page's time line.")] = 5.0,
-    min_score: options.MinScoreOption = 0.3,
+    score_threshold: options.ScoreThresholdOption = 0.3,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
     sensor_height: options.HeightOption = None,
@@ -61,7 +61,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     device: options.DeviceOption = "auto",
     precision: options.PrecisionOption = "auto",
 ) -> None:
-    """Draw sweeps from above, with boxes, and the boxes into the camera image; no display is needed.
+    """Draw sweeps in BEV, with boxes, and the boxes into the camera image; no display is needed.
 
     Examples:
       beambox show scan.bin --model pointpillars-sim --out scan.png
@@ -75,11 +75,9 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     a YAML file brings its own labels. A page (.html) shows points and boxes in three dimensions in any browser, several
     sweeps with a time line, and needs no other file.
     """
-    from beambox.data.existence import expect_inputs
-
-    check_choices(colour, model, results)
+    check_choices(color, model, results)
     check_rate(rate)
-    expect_inputs(inputs)
+    options.expect_there(inputs, model)
 
     from beambox.cli import show_inputs
     from beambox.geometry.axes import Axes
@@ -89,7 +87,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     shown = region_of_option(area)
     source = show_inputs.data_set_of(inputs, split)
     sweeps = show_inputs.sweeps_of(
-        inputs, source, frame, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
+        inputs, source, names, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
     )
     paths = picture_paths(sweeps, out)
     detector = show_inputs.detector_for(
@@ -110,7 +108,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         for sweep in progress(sweeps, len(sweeps), "Drawing"):
             yield scene_of(sweep.read(), detector, results, labels, turned)
 
-    write_all(out, paths, sweeps, scenes(), detector, shown, colour, min_score, rate)
+    write_all(out, paths, sweeps, scenes(), detector, shown, color, score_threshold, rate)
 
 
 FILMS = (".gif", ".webp", ".mp4")
@@ -118,7 +116,7 @@ FILMS = (".gif", ".webp", ".mp4")
 
 def scene_of(frame: Frame, detector: Detector | None, results: Path | None, labels: str, axes: Axes) -> Scene:
     """Return what is known of a sweep, forward up."""
-    from beambox.visualise.scene import Scene
+    from beambox.visualize.scene import Scene
 
     truth = truth_of(frame, labels)
     detections = found_in(frame, detector, results)
@@ -133,23 +131,23 @@ def write_all(
     scenes: Iterator[Scene],
     detector: Detector | None,
     shown: Region | None,
-    colour: str,
-    min_score: float,
+    color: str,
+    score_threshold: float,
     rate: float,
 ) -> None:
     """Write the page, the film or the pictures."""
     if out.suffix.lower() == ".html":
-        write_scenes(out, scenes, min_score, rate)
+        write_scenes(out, scenes, score_threshold, rate)
     elif out.suffix.lower() in FILMS:
-        write_film(out, film_pictures(scenes, detector, shown, colour, min_score), rate)
+        write_film(out, film_pictures(scenes, detector, shown, color, score_threshold), rate)
     else:
-        write_pictures(paths, sweeps, (picture_of(one, detector, shown, colour, min_score) for one in scenes))
+        write_pictures(paths, sweeps, (picture_of(one, detector, shown, color, score_threshold) for one in scenes))
 
 
-def check_choices(colour: str, model: str, results: Path | None) -> None:
+def check_choices(color: str, model: str, results: Path | None) -> None:
     """Refuse what cannot be drawn before anything is read."""
-    if colour not in ("height", "intensity"):
-        raise BeamboxError(f'unknown colour "{colour}"{did_you_mean(colour, ["height", "intensity"])}')
+    if color not in ("height", "intensity"):
+        raise BeamboxError(f'unknown colour "{color}"{did_you_mean(color, ["height", "intensity"])}')
     if model and results is not None:
         raise BeamboxError("give --model to detect now or --results to draw what was found before, not both")
     if results is not None and not results.is_dir():
@@ -158,7 +156,7 @@ def check_choices(colour: str, model: str, results: Path | None) -> None:
 
 def region_of_option(area: str) -> Region | None:
     """Read the value of --area."""
-    from beambox.visualise.bev import Region
+    from beambox.visualize.bev import Region
 
     numbers = options.parse_range(area, "--area")
     if numbers is None:
@@ -172,7 +170,7 @@ def picture_paths(sweeps: Sequence[Shown], out: Path) -> list[Path]:
     Raises:
         BeamboxError: if the name's ending says no known form, or one picture is to hold several sweeps.
     """
-    from beambox.visualise.video import can_write
+    from beambox.visualize.video import can_write
 
     ending = out.suffix.lower()
     if ending in FILMS:
@@ -191,26 +189,26 @@ def picture_paths(sweeps: Sequence[Shown], out: Path) -> list[Path]:
     return [out / f"{sweep.name}.png" for sweep in sweeps]
 
 
-def write_scenes(out: Path, scenes: Iterable[Scene], min_score: float, rate: float) -> None:
+def write_scenes(out: Path, scenes: Iterable[Scene], score_threshold: float, rate: float) -> None:
     """Write all sweeps into one 3-D page."""
     from beambox.io import write_text
-    from beambox.visualise.scene import scene_html
+    from beambox.visualize.scene import scene_html
 
     some = list(scenes)
-    write_text(out, scene_html(some, min_score=min_score, period=1 / rate))
+    write_text(out, scene_html(some, score_threshold=score_threshold, period=1 / rate))
     print(f"{some[0].frame.id if len(some) == 1 else f'{len(some)} sweeps'} -> {out}")
 
 
 def write_film(out: Path, pictures: Iterable[Image], rate: float) -> None:
     """Write all sweeps into one film."""
-    from beambox.visualise.video import write_video
+    from beambox.visualize.video import write_video
 
     print(f"{write_video(out, pictures, rate)} sweeps -> {out}")
 
 
 def write_pictures(paths: Sequence[Path], sweeps: Sequence[Shown], pictures: Iterable[Image]) -> None:
     """Write a picture per sweep."""
-    from beambox.visualise.canvas import save_picture
+    from beambox.visualize.canvas import save_picture
 
     for path, sweep, picture in zip(paths, sweeps, pictures):
         save_picture(picture, path)
@@ -224,14 +222,14 @@ def check_rate(rate: float) -> None:
 
 
 def film_pictures(
-    scenes: Iterable[Scene], detector: Detector | None, shown: Region | None, colour: str, min_score: float
+    scenes: Iterable[Scene], detector: Detector | None, shown: Region | None, color: str, score_threshold: float
 ) -> Iterator[Image]:
     """Draw the sweeps of a film: all show the same metres around the sensor, which the first sweep chooses."""
-    from beambox.visualise.bev import region_of
+    from beambox.visualize.bev import region_of
 
     for scene in scenes:
         shown = shown or region_of(scene.frame, None if scene.labels is None else scene.labels.boxes)
-        yield picture_of(scene, detector, shown, colour, min_score)
+        yield picture_of(scene, detector, shown, color, score_threshold)
 
 
 def truth_of(frame: Frame, labels: str) -> Labels | None:
@@ -268,35 +266,37 @@ def forward_up(
     frame: Frame, detections: Detections | None, truth: Labels | None, axes: Axes
 ) -> tuple[Frame, Detections | None, Labels | None]:
     """Turn points of other axes to x forward, y left, z up, and the boxes with them."""
-    from beambox.infer.corrections import Corrections
+    from beambox.infer.sensor_alignment import SensorAlignment
 
-    turn = Corrections(axes)
+    turn = SensorAlignment(axes)
     if turn.nothing:
         return frame, detections, truth
     return (
         replace(turn.apply(frame), image_path=None),  # the camera knows the points' own axes only
-        detections and replace(detections, boxes=turn.carry_forward(detections.boxes)),
-        truth and truth.with_boxes(turn.carry_forward(truth.boxes)),
+        detections and replace(detections, boxes=turn.from_sensor(detections.boxes)),
+        truth and truth.with_boxes(turn.from_sensor(truth.boxes)),
     )
 
 
-def picture_of(scene: Scene, detector: Detector | None, shown: Region | None, colour: str, min_score: float) -> Image:
+def picture_of(
+    scene: Scene, detector: Detector | None, shown: Region | None, color: str, score_threshold: float
+) -> Image:
     """Draw, with the detector's region where there is one."""
-    from beambox.visualise.bev import Region
-    from beambox.visualise.picture import draw_sweep
+    from beambox.visualize.bev import Region
+    from beambox.visualize.picture import draw_sweep
 
-    looked_at = None
+    detection_range = None
     if detector is not None:
         (x0, y0, _), (x1, y1, _) = detector.grid.minimum, detector.grid.maximum
-        looked_at = Region(x0, y0, x1, y1)
+        detection_range = Region(x0, y0, x1, y1)
     detections = scene.detections
     if detections is not None:
-        detections = detections.above(min_score)
+        detections = detections.above(score_threshold)
     return draw_sweep(
         scene.frame,
         detections,
         scene.labels,
         region=shown,
-        looked_at=looked_at,
-        colour_by="height" if colour == "height" else "intensity",
+        detection_range=detection_range,
+        color_by="height" if color == "height" else "intensity",
     )

@@ -35,7 +35,7 @@ def data_set_of(inputs: Sequence[str], split: str) -> FrameSource | None:
         BeamboxError: if a data set stands among other inputs.
     """
     from beambox.data.custom import CustomSource
-    from beambox.data.opening import open_data
+    from beambox.data.open_dataset import open_dataset
 
     described = [path for path in map(Path, inputs) if path.suffix.lower() in (".yaml", ".yml")]
     folders = [path for path in map(Path, inputs) if _own_layout(path)]
@@ -45,7 +45,7 @@ def data_set_of(inputs: Sequence[str], split: str) -> FrameSource | None:
         raise BeamboxError(f"a data set is shown by itself, but {(described or folders)[0]} stands among other inputs")
     if described:
         return CustomSource(described[0], split or "all", whole=True)
-    return open_data(folders[0], split or "all")
+    return open_dataset(folders[0], split or "all")
 
 
 def _own_layout(path: Path) -> bool:

@@ -42,17 +42,20 @@ def command(
 ) -> None:
     """Simulate labelled LiDAR sweeps. An interrupted or shorter data set is continued by the same command."""
     from beambox.checks import BeamboxError
-    from beambox.cli.console import announce, say
+    from beambox.cli.options import expect_there
+
+    expect_there([compare])
+    from beambox.cli.console import announce, log
     from beambox.verbs import open_dataset, simulate
 
     if compare and files != "kitti":
         raise BeamboxError(f"--compare reads KITTI's layout, and --format is {files}; leave one of the two out")
     real = open_dataset(compare, "train", camera_view=True) if compare else None  # refused before an hour of work
-    told = ", ".join(f"{name} {value}" for name, value in (("sensor", sensor), ("view", view)) if value)
+    details = ", ".join(f"{name} {value}" for name, value in (("sensor", sensor), ("view", view)) if value)
     announce(
         "simulate",
         seed=seed,
-        detail=f"{frames} frames in the layout of {files.upper()}, {told + ', ' if told else ''}layout {layout}",
+        detail=f"{frames} frames in the layout of {files.upper()}, {details + ', ' if details else ''}layout {layout}",
     )
     simulate(
         out,
@@ -67,7 +70,7 @@ def command(
         val_share=val_share,
         sequence_length=sequence_length,
     )
-    say(f"wrote {frames} frames to {out}")
+    log(f"wrote {frames} frames to {out}")
     if real is not None:
         from beambox.simulate.compare import compare_objects
 

@@ -9,7 +9,7 @@ import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
-from beambox.cli.console import announce, say, show_log
+from beambox.cli.console import announce, log, show_log
 
 if TYPE_CHECKING:
     from beambox.infer.predictor import Detector
@@ -28,7 +28,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     realtime: Annotated[bool, typer.Option("--realtime", help="Play as recorded; drop old sweeps to keep up.")] = False,
     speed: Annotated[float, typer.Option(metavar="X", help="With --realtime: play X times as fast.")] = 1.0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Sweeps per second of a folder.")] = 10.0,
-    min_score: options.MinScoreOption = 0.1,
+    score_threshold: options.ScoreThresholdOption = 0.1,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
     sensor_height: options.HeightOption = None,
@@ -49,22 +49,24 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     Written for each sweep, below its topic: beambox/markers (MarkerArray), beambox/detections (Detection3DArray) and
     beambox/scene (Foxglove SceneUpdate).
     """
+    options.expect_there([source], model)
+    if not (rate > 0 and speed > 0):
+        raise BeamboxError(f"--rate and --speed must be above 0, got {rate:g} and {speed:g}")
+    if out.resolve() == source.resolve():
+        raise BeamboxError(f"{out} is the recording that is read; give another name")
+
     from beambox.infer.predictor import load
     from beambox.stream.run import in_real_time, recording_writer, run_stream
     from beambox.stream.source import arrivals
 
     show_log()
-    if not (rate > 0 and speed > 0):
-        raise BeamboxError(f"--rate and --speed must be above 0, got {rate:g} and {speed:g}")
-    if not source.exists() and not any(parent.is_file() for parent in source.parents):
-        raise BeamboxError(f"{source} is not there")
-    if out.resolve() == source.resolve():
-        raise BeamboxError(f"{out} is the recording that is read; give another name")
     tracker = None
     if track:
         from beambox.track import Tracker, TrackerOptions
 
-        tracker = Tracker(TrackerOptions(min_score=min_score, birth_score=max(0.3, min_score)), rate=rate)
+        tracker = Tracker(
+            TrackerOptions(score_threshold=score_threshold, birth_score=max(0.3, score_threshold)), rate=rate
+        )
     detector = load(
         model,
         device=device,
@@ -78,26 +80,32 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         fields=fields or None,
     )
     announce("stream", detail=f"{model} on {detector.device} in {str(detector.dtype).removeprefix('torch.')}")
-    told = {"model": model, "source": source.name, "topic": topic, "track": track, "min_score": min_score}
-    told |= {"range": range_, "view": view, "sensor_height": sensor_height, "axes": axes, "precision": precision}
+    settings = {
+        "model": model,
+        "source": source.name,
+        "topic": topic,
+        "track": track,
+        "score_threshold": score_threshold,
+    }
+    settings |= {"range": range_, "view": view, "sensor_height": sensor_height, "axes": axes, "precision": precision}
     dropped: list[str] = []
     sweeps = arrivals(source, topic, rate=rate, fields=fields or None, intensity_scale=intensity_scale)
     if realtime:
         warm_up(detector)
         sweeps = in_real_time(sweeps, lambda sweep: dropped.append(sweep.name), speed=speed)
-    with recording_writer(out, told) as write:
+    with recording_writer(out, settings) as write:
         report = run_stream(
             sweeps,
             lambda frame: detector.detect([frame])[0],
             tracker,
             write,
-            min_score=min_score,
-            notice=lambda text: say(f"beambox: {text}"),
+            score_threshold=score_threshold,
+            notice=lambda text: log(f"beambox: {text}"),
         )
         report.dropped = len(dropped)
         if not report.done:
             raise BeamboxError(f"{source}: no sweep could be read, so nothing was written")
-    say(report.text())
+    log(report.text())
     print(f"{report.done} sweeps, {report.objects} boxes -> {out}")
 
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from beambox.cli.options import expect_there
+
 __all__ = ["command"]
 
 
@@ -18,6 +20,8 @@ def command(
 
     Example: beambox detect testing/velodyne --model M --format kitti --out results && beambox submit results
     """
+    expect_there([results])
+
     from beambox.data.submission import write_submission
 
     write_submission(results, out)

@@ -11,7 +11,7 @@ import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
-from beambox.cli.console import announce, progress, say, show_log
+from beambox.cli.console import announce, log, progress, show_log
 
 if TYPE_CHECKING:
     from beambox.geometry import Calibration
@@ -34,12 +34,12 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         "tracks.csv"
     ),
     calib: Annotated[Path | None, typer.Option(metavar="PATH", help="Calib file of the drive, or folder.")] = None,
-    poses: Annotated[Path | None, typer.Option(metavar="FILE", help="Poses, one a line: KITTI, 4x4 or TUM.")] = None,
+    poses: Annotated[Path | None, typer.Option(metavar="FILE", help="Poses, one per line: KITTI, 4x4 or TUM.")] = None,
     poses_of: Annotated[str, typer.Option(help="Whose poses: lidar, or camera (KITTI odometry).")] = "lidar",
     rate: Annotated[float, typer.Option(metavar="HZ", help="Sweeps per second, where files tell no time.")] = 10.0,
     birth_score: Annotated[float, typer.Option(metavar="S", help="A detection from here on may start a track.")] = 0.3,
     confirm_score: Annotated[float, typer.Option(metavar="S", help="Report tracks from this mean score on.")] = 0.5,
-    min_score: Annotated[float, typer.Option("--min-score", metavar="S", help="Leave out lower detections.")] = 0.1,
+    score_threshold: options.ScoreThresholdOption = 0.1,
     coast: Annotated[float, typer.Option(metavar="S", help="Seconds to report a track without detection.")] = 0.0,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
@@ -56,9 +56,11 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
       beambox track --results detections --calib calib.txt --out tracks.txt
       beambox track drive.mcap -m pointpillars-kitti --poses poses.txt --out tracks.jsonl
 
-    With poses (from the LiDAR to a fixed frame, one a sweep) velocities are over ground; without them relative to the
+    With poses (from the LiDAR to a fixed frame, one per sweep) velocities are over ground; without them relative to the
     sensor. Score KITTI's format by `beambox score tracking`.
     """
+    options.expect_there([*(inputs or []), results, calib, poses], model)
+
     from beambox.infer.inputs import find_sweeps
     from beambox.track import Tracker, TrackerOptions
     from beambox.track.files import check_ending
@@ -68,8 +70,10 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     check_ending(out)
     if bool(model) == (results is not None) or bool(model) != bool(inputs):
         raise BeamboxError("give sweeps and --model M, or --results DIR and no sweeps")
-    birth = max(birth_score, min_score)
-    chosen = TrackerOptions(min_score=min_score, birth_score=birth, confirm_score=confirm_score, coast=coast)
+    birth = max(birth_score, score_threshold)
+    chosen = TrackerOptions(
+        score_threshold=score_threshold, birth_score=birth, confirm_score=confirm_score, coast=coast
+    )
     tracker = Tracker(chosen, rate=rate)
     given = given_poses(poses, poses_of, calib)
     sweeps = find_sweeps(inputs or [])
@@ -112,7 +116,7 @@ def write_tracks(
             print(f"{step.name}: {len(tracks)} tracks")
             total += 1
     counts = ", ".join(f"{count} {name}" for name, count in Counter(classes.values()).items()) or "none"
-    say(f"{total} sweeps, {len(classes)} tracks ({counts}) -> {out}")
+    log(f"{total} sweeps, {len(classes)} tracks ({counts}) -> {out}")
 
 
 def given_poses(path: Path | None, whose: str, calib: Path | None) -> Poses | None:
@@ -151,7 +155,7 @@ def detect_steps(detector: Detector, sweeps: list[Sweep]) -> Iterator[Step]:
         except BeamboxError as error:
             if len(sweeps) == 1:
                 raise
-            say(f"beambox: no detections: {error}")
+            log(f"beambox: no detections: {error}")
             found = Detections.empty(detector.classes, sweep.name)
         yield Step(sweep.name, number, found)
 

@@ -32,6 +32,12 @@ def command(
 
     On many GPUs or machines: torchrun --nproc-per-node 8 -m beambox train RECIPE --data DIR
     """
+    from beambox.data.existence import expect_data
+    from beambox.train.recipes import find_recipe
+
+    find_recipe(recipe)
+    expect_data(data)
+
     from beambox.verbs import train
 
     if not train(recipe, data, out, overrides=change or [], resume=resume).finished:

@@ -26,12 +26,12 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         Path | None, typer.Option(metavar="DIR", help="Show these detections (json, csv, KITTI).")
     ] = None,
     labels: Annotated[str, typer.Option(metavar="DIR", help="Ground truth in KITTI's format; none shows none.")] = "",
-    colour: Annotated[str, typer.Option(help="Points by height or intensity.")] = "height",
+    color: Annotated[str, typer.Option(help="Points by height or intensity.")] = "height",
     split: Annotated[str, typer.Option(help="Of a data set: the list of frames; all of them where not given.")] = "",
-    frame: Annotated[str, typer.Option(metavar="NAMES", help="Only the sweeps of these names.")] = "",
+    names: Annotated[str, typer.Option(metavar="NAMES", help="Only the sweeps of these names.")] = "",
     frames: Annotated[int, typer.Option(min=0, help="Only the first so many sweeps; 0: all.")] = 0,
     rate: Annotated[float, typer.Option(help="Sweeps per second of the time line.")] = 10.0,
-    min_score: options.MinScoreOption = 0.3,
+    score_threshold: options.ScoreThresholdOption = 0.3,
     range_: options.RangeOption = "",
     view: options.ViewOption = "auto",
     sensor_height: options.HeightOption = None,
@@ -46,24 +46,23 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
       beambox view drive --model pointpillars-sim
       beambox view drive.mcap --model pointpillars-sim --out drive.rrd
 
-    With a model, sweeps appear as they are detected in, with the network's class scores seen from above.
+    With a model, sweeps appear as they are detected in, with the network's class scores in BEV.
     """
     from beambox.cli import show_inputs
     from beambox.cli.show import check_choices, check_rate, found_in, truth_of
-    from beambox.data.existence import expect_inputs
 
-    check_choices(colour, model, results)
+    check_choices(color, model, results)
     check_rate(rate)
-    expect_inputs(inputs)
+    options.expect_there(inputs, model)
 
     from beambox.infer.score_map import detect_with_scores
-    from beambox.visualise.rerun_log import RerunLog, import_rerun
+    from beambox.visualize.rerun_log import RerunLog, import_rerun
 
     show_log()
     import_rerun()
     source = show_inputs.data_set_of(inputs, split)
     sweeps = show_inputs.sweeps_of(
-        inputs, source, frame, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
+        inputs, source, names, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
     )
     detector = show_inputs.detector_for(
         model,
@@ -76,7 +75,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         intensity_scale=intensity_scale,
         fields=fields or None,
     )
-    log = RerunLog(out, colour_by="height" if colour == "height" else "intensity")
+    log = RerunLog(out, color_by="height" if color == "height" else "intensity")
     for number, sweep in enumerate(progress(sweeps, len(sweeps), "Detecting" if model else "Reading")):
         read, scores = sweep.read(), None
         truth = truth_of(read, labels)
@@ -85,6 +84,6 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         else:
             detections, scores = detect_with_scores(detector, read)
         if detections is not None:
-            detections = detections.above(min_score)
+            detections = detections.above(score_threshold)
         log.add(read, detections, truth, scores=scores, seconds=number / rate)
     print(f"{log.close()} sweeps -> {out or 'the viewer'}")

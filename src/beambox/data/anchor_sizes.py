@@ -24,14 +24,14 @@ class AnchorProposal:
     """Number of labels it comes from."""
     size: tuple[float, float, float]
     """Mean length, width and height, metres."""
-    bottom: float
+    bottom_z: float
     """Median height of the lower faces, metres."""
-    matched: float
+    matched_threshold: float
     """Overlap from which an anchor is positive."""
-    unmatched: float
+    unmatched_threshold: float
     """Overlap below which an anchor is negative."""
     covered: float
-    """Share of the boxes that overlap the anchor by ``matched`` when both stand at one place and look one way."""
+    """Share of the boxes whose IoU with the anchor at the same place and heading is at least ``matched_threshold``."""
 
 
 def propose_anchors(labels: Iterable[Labels]) -> list[AnchorProposal]:
@@ -53,19 +53,19 @@ def propose_anchors(labels: Iterable[Labels]) -> list[AnchorProposal]:
 
 def _proposal(name: str, boxes: np.ndarray) -> AnchorProposal:
     length, width, height = (float(value) for value in boxes[:, 3:6].mean(axis=0).round(2))
-    matched, unmatched = (0.6, 0.45) if length > LARGE and width > LARGE else (0.5, 0.35)
+    matched_threshold, unmatched_threshold = (0.6, 0.45) if length > LARGE and width > LARGE else (0.5, 0.35)
     mean = np.array([length, width, height])
     bottoms = boxes[:, 2] - boxes[:, 5] / 2
-    shared = np.minimum(boxes[:, 3:5], mean[:2]).prod(axis=1)  # seen from above, as anchors are matched
+    shared = np.minimum(boxes[:, 3:5], mean[:2]).prod(axis=1)  # in BEV, as anchors are matched
     union = boxes[:, 3:5].prod(axis=1) + mean[:2].prod() - shared
     return AnchorProposal(
         name=name,
         boxes=len(boxes),
         size=(length, width, height),
-        bottom=float(np.median(bottoms).round(2)),
-        matched=matched,
-        unmatched=unmatched,
-        covered=float((shared / union >= matched).mean()),
+        bottom_z=float(np.median(bottoms).round(2)),
+        matched_threshold=matched_threshold,
+        unmatched_threshold=unmatched_threshold,
+        covered=float((shared / union >= matched_threshold).mean()),
     )
 
 
@@ -76,12 +76,13 @@ def proposals_text(proposals: Iterable[AnchorProposal]) -> str:
     for one in proposals:
         length, width, height = one.size
         lines.append(
-            f"      - {{name: {one.name}, size: [{length:.2f}, {width:.2f}, {height:.2f}], bottom: {one.bottom:.2f}, "
-            f"matched: {one.matched:.2f}, unmatched: {one.unmatched:.2f}}}"
+            f"      - {{name: {one.name}, size: [{length:.2f}, {width:.2f}, {height:.2f}], "
+            f"bottom_z: {one.bottom_z:.2f}, matched_threshold: {one.matched_threshold:.2f}, "
+            f"unmatched_threshold: {one.unmatched_threshold:.2f}}}"
             f"  # {one.boxes} boxes, {100 * one.covered:.0f} % fit"
         )
     poor = [one.name for one in proposals if one.covered < 0.8 and one.boxes >= 20]
-    lines += [f"# {name}: sizes vary much; split the class or lower `matched`" for name in poor]
+    lines += [f"# {name}: sizes vary much; split the class or lower `matched_threshold`" for name in poor]
     rare = [one.name for one in proposals if one.boxes < 20]
     lines += [f"# {name}: few boxes; take a size from experience" for name in rare]
     return "\n".join(lines) + "\n"

@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from beambox.checks import BeamboxError
+from beambox.data.bev_overlap import bev_overlap
 from beambox.data.database import ObjectDatabase
-from beambox.data.footprints import overlap_bev
-from beambox.data.road import fit_road_plane
+from beambox.data.ground_plane import fit_ground_plane
 from beambox.geometry.boxes import flip_boxes_x, flip_boxes_y, rotate_boxes, scale_boxes
 from beambox.ops.points_in_boxes import points_in_boxes
 from beambox.structures import Frame, Labels
@@ -77,7 +77,7 @@ def augment(
     rng: np.random.Generator,
     config: AugmentConfig,
     database: ObjectDatabase | None = None,
-    turn: int = 0,
+    draw_index: int = 0,
     seed: int = 0,
 ) -> Frame:
     """Augment a labelled frame; its camera no longer fits the points and is dropped.
@@ -87,7 +87,7 @@ def augment(
         rng: source of every draw but those from the database.
         config: what to do.
         database: objects to sample from; None samples none.
-        turn: number of the frame in the run, which tells where the walk through the database stands.
+        draw_index: number of the frame in the run, which tells where the walk through the database stands.
         seed: names the walk through the database.
 
     Raises:
@@ -100,7 +100,7 @@ def augment(
     mirror_x, mirror_y = rng.random(2)
     angle, factor = rng.uniform(-1, 1), rng.uniform(*config.scaling)
     if database is not None:
-        frame = sample_objects(frame, config, database, turn, seed)
+        frame = sample_objects(frame, config, database, draw_index, seed)
     frame = replace(frame, calibration=None, image_path=None, image_size=None, plane=None)
     if config.object_rotation > 0 or any(sigma > 0 for sigma in config.object_translation):
         frame = move_objects(
@@ -117,7 +117,7 @@ def augment(
     return shuffle_points(frame, shuffle_rng) if config.shuffle else frame
 
 
-def sample_objects(frame: Frame, config: AugmentConfig, database: ObjectDatabase, turn: int, seed: int) -> Frame:
+def sample_objects(frame: Frame, config: AugmentConfig, database: ObjectDatabase, draw_index: int, seed: int) -> Frame:
     """Place objects from the database where they stood in their own sweeps, if they stand free there.
 
     Scene points inside an accepted box are removed, the objects' points come first. Without a road plane in the frame
@@ -126,11 +126,11 @@ def sample_objects(frame: Frame, config: AugmentConfig, database: ObjectDatabase
     labels = _labels(frame)
     present = Counter(labels.names) if config.sample_whole_scene else None
     scene_boxes = labels.boxes.numpy()
-    objects, names = database.sample(scene_boxes, list(config.sample.items()), turn, seed, present)
+    objects, names = database.sample(scene_boxes, list(config.sample.items()), draw_index, seed, present)
     if len(objects) == 0:
         return frame
     boxes = database.boxes[objects]  # (K, 7), a copy
-    plane = frame.plane if frame.plane is not None or not config.sample_on_road else fit_road_plane(frame.points)
+    plane = frame.plane if frame.plane is not None or not config.sample_on_road else fit_ground_plane(frame.points)
     if plane is not None and config.sample_on_road:
         a, b, c, d = plane.tolist()
         boxes[:, 2] = -(a * boxes[:, 0] + b * boxes[:, 1] + d) / c + boxes[:, 5] / 2
@@ -160,7 +160,7 @@ def move_objects(
         rng: source of the draws.
         rotation: each turns about its centre by U(-rotation, rotation), radians.
         translation: each shifts by N(0, translation), metres along x, y, z.
-        trials: draws an object gets; the first that overlaps no other box, seen from above, holds.
+        trials: draws an object gets; the first that overlaps no other box, in BEV, holds.
     """
     labels = _labels(frame)
     if len(labels) == 0:
@@ -196,7 +196,7 @@ def _rows_of_objects(frame: Frame, boxes: Tensor) -> list[np.ndarray]:
 def _first_free(tries: np.ndarray, others: np.ndarray) -> int | None:
     """Return the first of ``(T, 7)`` boxes that overlaps none of ``(M, 7)``; most often it is one of the first few."""
     for part in (slice(0, FIRST_TRIALS), slice(FIRST_TRIALS, None)):
-        free = np.flatnonzero(~overlap_bev(tries[part, None], others).any(axis=1))
+        free = np.flatnonzero(~bev_overlap(tries[part, None], others).any(axis=1))
         if len(free):
             return int(free[0]) + (part.start or 0)
     return None
@@ -219,7 +219,7 @@ def flip_y(frame: Frame) -> Frame:
 
 
 def rotate(frame: Frame, angle: float) -> Frame:
-    """Turn points and boxes about the sensor's z axis by ``angle`` radians, counter-clockwise seen from above."""
+    """Turn points and boxes about the sensor's z axis by ``angle`` radians, counter-clockwise in BEV."""
     points = frame.points.clone()
     cos, sin = math.cos(angle), math.sin(angle)
     x, y = frame.points[:, 0], frame.points[:, 1]

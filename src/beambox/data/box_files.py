@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data import kitti_text
-from beambox.data.labels.catalogue import FORMATS, parse_labels
+from beambox.data.labels.catalog import FORMATS, parse_labels
 from beambox.data.labels.tables import DEGREES
 from beambox.data.labels.tables import SYNONYMS as ALIASES
 from beambox.geometry.calibration import Calibration
@@ -72,7 +72,7 @@ def parse_box_file(text: str, kind: str, where: str) -> NamedBoxes:
 
     Args:
         text: content of the file.
-        kind: pandaset, csv or json, or a name of :data:`beambox.data.labels.catalogue.FORMATS`.
+        kind: pandaset, csv or json, or a name of :data:`beambox.data.labels.catalog.FORMATS`.
         where: what errors call the file.
 
     Raises:
@@ -94,7 +94,7 @@ def parse_frames_file(text: str, kind: str, where: str) -> dict[str, NamedBoxes]
     if kind in FORMATS and FORMATS[kind].write_all is not None:
         return _tool_boxes(text, kind, where)
     if kind not in ("csv", "json", "once"):
-        raise BeamboxError(f"{where}: boxes in {kind} format come as one file a frame; put {{frame}} into its path")
+        raise BeamboxError(f"{where}: boxes in {kind} format come as one file per frame; put {{frame}} into its path")
     rows = {"csv": _csv_rows, "json": _json_rows, "once": _once_rows}[kind](text, where)
     by_frame: dict[str, list[tuple[str, Sequence[float], str]]] = {}
     for frame, name, numbers, place in rows:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError
+from beambox.data.ground_plane import height_and_slope
 from beambox.data.placements import BEYOND_A_TURN, count_filled, up_axis
-from beambox.data.road import height_and_slope
 from beambox.data.source import FrameSource
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.structures import Frame
@@ -43,7 +43,7 @@ class BoxFacts:
     """``(M,)`` points inside."""
     gap: Floats
     """``(M,)`` lower face less the ground nearby, metres; NaN where no ground is seen."""
-    as_labelled: NDArray[np.int64]
+    as_labeled: NDArray[np.int64]
     """``(M,)`` points inside the widened box."""
     across: NDArray[np.int64]
     """``(M,)`` points inside the box turned by 90 degrees."""
@@ -56,7 +56,7 @@ class BoxFacts:
             self.boxes[rows],
             self.points[rows],
             self.gap[rows],
-            self.as_labelled[rows],
+            self.as_labeled[rows],
             self.across[rows],
             self.mirrored[rows],
         )
@@ -68,7 +68,7 @@ class BoxFacts:
             np.concatenate([part.boxes for part in parts]),
             np.concatenate([part.points for part in parts]),
             np.concatenate([part.gap for part in parts]),
-            np.concatenate([part.as_labelled for part in parts]),
+            np.concatenate([part.as_labeled for part in parts]),
             np.concatenate([part.across for part in parts]),
             np.concatenate([part.mirrored for part in parts]),
         )
@@ -121,7 +121,7 @@ class DataReport:
 
     frames: int = 0
     """Frames looked at."""
-    unlabelled: list[str] = field(default_factory=list)
+    unlabeled: list[str] = field(default_factory=list)
     """Frames without a label file."""
     without_points: list[str] = field(default_factory=list)
     """Frames without a point."""
@@ -168,9 +168,9 @@ class DataReport:
         self.frames += 1
         self.point_counts.append(len(frame))
         for note in frame.notes:
-            told = "".join("#" if letter.isdigit() else letter for letter in note)
-            self.notes[told] = self.notes.get(told, 0) + 1
-            self.note_texts.setdefault(told, set()).add(note)
+            pattern = "".join("#" if letter.isdigit() else letter for letter in note)
+            self.notes[pattern] = self.notes.get(pattern, 0) + 1
+            self.note_texts.setdefault(pattern, set()).add(note)
         if len(frame):
             values = frame.points[:, 3]
             self.intensity.append((float(values.min()), float(values.max())))
@@ -182,7 +182,7 @@ class DataReport:
             self.ground.append(ground)
             self.slopes.append(slope)
         if frame.labels is None:
-            self.unlabelled.append(frame.id)
+            self.unlabeled.append(frame.id)
             return
         if not len(frame.labels):
             self.without_boxes.append(frame.id)
@@ -195,9 +195,9 @@ class DataReport:
         inside = (x >= low_x) & (x < high_x) & (y >= low_y) & (y < high_y)
         for name in dict.fromkeys(frame.labels.names):
             rows = names == name
-            held = self.by_class.setdefault(name, ClassFacts())
-            held.parts.append(facts.only(rows))
-            held.outside += int((rows & ~inside).sum())
+            class_facts = self.by_class.setdefault(name, ClassFacts())
+            class_facts.parts.append(facts.only(rows))
+            class_facts.outside += int((rows & ~inside).sum())
 
     def _add_points(self, frame: Frame) -> None:
         scale = next((note.split()[-1] for note in frame.notes if note.startswith("intensity divided by ")), "1")

@@ -1,7 +1,7 @@
 """A data set of one's own, described by one small YAML file; see docs/custom_data.md.
 
 Frames come in the house's LiDAR frame: x forward, y left, z up, and the ground at -1.73 m where the sensor's height is
-known. No camera is needed; there are no difficulty levels, and the metrics give one AP a class.
+known. No camera is needed; there are no difficulty levels, and the metrics give one AP per class.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from beambox.data.box_files import (
     parse_kitti_boxes,
 )
 from beambox.data.custom_config import CustomConfig, read_custom_config
+from beambox.data.ground_plane import fit_ground_plane
 from beambox.data.kitti_calibration import read_calibration
 from beambox.data.names import NameList
-from beambox.data.reading import read_shifted
-from beambox.data.road import fit_road_plane
+from beambox.data.read_points import read_shifted
 from beambox.geometry.axes import Axes, turn_boxes
 from beambox.geometry.boxes import wrap_angle
 from beambox.io import read_names, read_text
@@ -95,7 +95,7 @@ class CustomSource:
         labels = self._placed(self._boxes(name), shift)
         if not self.whole:
             points, labels = self._crop(points, labels)
-        return replace(frame, points=points, id=name, labels=labels, plane=fit_road_plane(points))
+        return replace(frame, points=points, id=name, labels=labels, plane=fit_ground_plane(points))
 
     def labels(self, index: int) -> Labels | None:
         """Read the boxes of a frame, and no points; None where the frame has no label file."""

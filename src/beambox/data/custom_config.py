@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.labels.catalogue import FORMATS
+from beambox.data.labels.catalog import FORMATS
 from beambox.geometry.axes import Axes, level_shift
 from beambox.io import read_yaml
 
@@ -24,7 +24,7 @@ LABEL_FORMATS = ("kitti", "once", "pandaset", "csv", "json", *FORMATS)
 
 
 class GroundSlope(BaseModel):
-    """How the ground rises, in metres a metre, where the sensor is mounted askew or the road leans all along."""
+    """How the ground rises, in metres per metre, where the sensor is mounted askew or the road leans all along."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
@@ -137,13 +137,13 @@ class CustomConfig(BaseModel):
         return {".csv": "csv", ".json": "json"}.get(Path(self.labels).suffix.lower())
 
     @property
-    def raise_by(self) -> float:
+    def z_offset(self) -> float:
         """Metres added to z, after the axes have been turned."""
         return 0.0 if self.sensor_height is None else self.sensor_height + KITTI_GROUND
 
     def shift(self, rows: Tensor) -> Tensor:
         """Metres added to z of points or boxes whose axes have been turned, ``(N,)``: KITTI's height, level ground."""
-        return level_shift(rows, self.raise_by, (self.ground_slope.forward, self.ground_slope.left))
+        return level_shift(rows, self.z_offset, (self.ground_slope.forward, self.ground_slope.left))
 
     def class_of(self, name: str, where: str) -> str | None:
         """Return the class wanted for a name in the files, or None to leave it out.

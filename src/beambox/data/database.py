@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from beambox.checks import BeamboxError, did_you_mean, expect_same_length
-from beambox.data.footprints import overlap_bev
+from beambox.data.bev_overlap import bev_overlap
 from beambox.data.formats.arrays import load_archive
 from beambox.data.formats.columns import decode
+from beambox.data.sampling import shuffled_indices
 from beambox.data.source import FrameSource
-from beambox.data.walk import walk
 from beambox.io import replacing
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 
@@ -178,13 +178,13 @@ class ObjectDatabase:
             frames=tuple(name for database in databases for name in database.frames),
         )
 
-    def draw(self, name: str, count: int, turn: int, seed: int, needed: int | None = None) -> np.ndarray:
-        """Return the objects that the ``turn``-th draw of ``count`` takes: a shuffled walk, each once a pass.
+    def draw(self, name: str, count: int, draw_index: int, seed: int, needed: int | None = None) -> np.ndarray:
+        """Return the objects that the ``draw_index``-th draw of ``count`` takes: a shuffled walk, each once per pass.
 
         Args:
             name: class to draw from.
             count: how many; fewer come where the class has fewer.
-            turn: number of the draw, 0 for the first of a run; a pure function of it and the seed.
+            draw_index: number of the draw, 0 for the first of a run; a pure function of it and the seed.
             seed: names the walk.
             needed: take only the first so many of them and pass over the others.
 
@@ -198,14 +198,14 @@ class ObjectDatabase:
         count = min(count, len(members))
         if count == 0:
             return np.zeros(0, dtype=np.int64)
-        steps = walk(len(members), turn * count, count, (seed, OBJECTS, kind))
+        steps = shuffled_indices(len(members), draw_index * count, count, (seed, OBJECTS, kind))
         return np.unique(members[steps[:needed]])
 
     def sample(
         self,
         existing: np.ndarray,
         wanted: Sequence[tuple[str, int]],
-        turn: int,
+        draw_index: int,
         seed: int,
         present: Mapping[str, int] | None = None,
     ) -> tuple[np.ndarray, list[str]]:
@@ -214,7 +214,7 @@ class ObjectDatabase:
         Args:
             existing: ``(N, 7)`` boxes already in the frame.
             wanted: (class, count) in the order of drawing.
-            turn: number of the draw; see :meth:`draw`.
+            draw_index: number of the draw; see :meth:`draw`.
             seed: names the walk.
             present: by class, how many of the count need not be drawn; none where a class is missing.
 
@@ -224,17 +224,17 @@ class ObjectDatabase:
         taken: list[np.ndarray] = []
         names: list[str] = []
         for name, count in wanted:
-            drawn = self.draw(name, count, turn, seed, max(0, count - (present or {}).get(name, 0)))
+            drawn = self.draw(name, count, draw_index, seed, max(0, count - (present or {}).get(name, 0)))
             candidates = self.boxes[drawn]  # (n, 7)
-            among = overlap_bev(candidates[:, None], candidates)  # (n, n)
+            among = bev_overlap(candidates[:, None], candidates)  # (n, n)
             np.fill_diagonal(among, False)
-            free = ~(among.any(axis=1) | overlap_bev(candidates[:, None], existing).any(axis=1))
+            free = ~(among.any(axis=1) | bev_overlap(candidates[:, None], existing).any(axis=1))
             taken.append(drawn[free])
             names += [name] * int(free.sum())
             existing = np.concatenate((existing, candidates[free]))
         return np.concatenate(taken) if taken else np.zeros(0, dtype=np.int64), names
 
-    def points_of(self, objects: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    def points_of(self, objects: np.ndarray, centers: np.ndarray) -> np.ndarray:
         """Return the points of some objects, carried to given centres: ``(K,)``, ``(K, 3)`` -> ``(P, C)`` float32."""
         first = self.offsets[objects]
         lengths = self.offsets[objects + 1] - first
@@ -242,7 +242,7 @@ class ObjectDatabase:
         total = int(ends[-1]) if len(ends) else 0
         rows = np.repeat(first - (ends - lengths), lengths) + np.arange(total)
         points = self.points[rows]  # a copy: advanced indexing
-        points[:, :3] += np.repeat(centres.astype(np.float32), lengths, axis=0)
+        points[:, :3] += np.repeat(centers.astype(np.float32), lengths, axis=0)
         return points
 
 

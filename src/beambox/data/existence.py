@@ -8,7 +8,7 @@ from pathlib import Path
 
 from beambox.checks import MissingFileError
 
-__all__ = ["expect_inputs"]
+__all__ = ["expect_data", "expect_inputs"]
 
 
 def expect_inputs(inputs: Iterable[str | Path]) -> None:
@@ -27,3 +27,14 @@ def expect_inputs(inputs: Iterable[str | Path]) -> None:
             raise MissingFileError(f"{given} is not there{hint}")
         if next(glob.iglob(given, recursive=True), None) is None:
             raise MissingFileError(f"no file fits the pattern {given}")
+
+
+def expect_data(path: Path | None) -> None:
+    """Check that a data set is there, where one is given.
+
+    Raises:
+        MissingFileError: naming it.
+    """
+    if path is not None and not path.exists():
+        kind = "file" if path.suffix in (".yaml", ".yml") else "folder"
+        raise MissingFileError(f"--data: there is no {kind} {path}")

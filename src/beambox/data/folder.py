@@ -4,11 +4,11 @@
 
     ROOT/
       points/NAME.bin  (.npy .npz .pcd .ply .las .laz)
-      labels/NAME.txt          a line an object: class x y z l w h yaw  (metres, radians; # begins a comment);
+      labels/NAME.txt          a line per object: class x y z l w h yaw  (metres, radians; # begins a comment);
                                x y z l w h yaw class, as OpenPCDet's custom data have it, is read as well
       ImageSets/train.txt      optional lists of names; where absent, every sweep
 
-x, y, z is the box's geometric centre; yaw grows counter-clockwise seen from above, 0 along +x. Further columns of a
+x, y, z is the box's geometric centre; yaw grows counter-clockwise in BEV, 0 along +x. Further columns of a
 label line are ignored. Other layouts, axes and classes are described by a YAML file: :mod:`beambox.data.custom`.
 """
 
@@ -23,7 +23,7 @@ import torch
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.box_files import box_words
-from beambox.data.reading import SUFFIXES, read_frame
+from beambox.data.read_points import read_frame, readable_suffixes
 from beambox.io import name_to_word, read_names, read_text
 from beambox.structures import Frame, Labels
 
@@ -50,8 +50,8 @@ class FolderSource:
             split: name of a list in ImageSets/; "all" is every sweep.
             points: name of the folder of sweeps.
             labels: name of the folder of labels; a sweep without a file there has no labels.
-            fields: see :func:`beambox.data.reading.read_frame`.
-            intensity_scale: see :func:`beambox.data.reading.read_frame`; give it where sweeps of one sensor are of
+            fields: see :func:`beambox.data.read_points.read_frame`.
+            intensity_scale: see :func:`beambox.data.read_points.read_frame`; give it where sweeps of one sensor are of
                 different brightness, so that all are scaled alike.
 
         Raises:
@@ -61,17 +61,17 @@ class FolderSource:
         self.root = Path(root)
         self.labels_folder = self.root / labels
         self.fields, self.intensity_scale = fields, intensity_scale
-        folder = self.root / points
+        folder, suffixes = self.root / points, readable_suffixes()
         if not folder.is_dir():
-            raise MissingFileError(f"{folder} is not a folder; expected one of sweeps ({' '.join(SUFFIXES)})")
+            raise MissingFileError(f"{folder} is not a folder; expected one of sweeps ({' '.join(suffixes)})")
         found: dict[str, Path] = {}
         for path in sorted(folder.iterdir()):
-            if path.suffix.lower() in SUFFIXES:
+            if path.suffix.lower() in suffixes:
                 if path.stem in found:
                     raise BeamboxError(f"{folder} holds two sweeps called {path.stem}; names must differ")
                 found[path.stem] = path
         if not found:
-            raise BeamboxError(f"{folder} must hold sweeps ({' '.join(SUFFIXES)}), but has none")
+            raise BeamboxError(f"{folder} must hold sweeps ({' '.join(suffixes)}), but has none")
         names = list(found) if split == "all" else _names(self.root / "ImageSets", split)
         for name in names:
             if name not in found:

@@ -38,7 +38,7 @@ from beambox.data.kitti_text import (
     read_labels,
     read_results,
 )
-from beambox.data.reading import read_frame
+from beambox.data.read_points import read_frame
 from beambox.geometry import Calibration
 from beambox.io import check_file_name, read_names, read_text, write_bytes, write_text
 from beambox.structures import Frame, Labels
@@ -152,14 +152,14 @@ class KittiSource:
         None has where there was no camera, and KITTI's levels are then unknown. Looks through label files until one
         tells; True where there are none.
         """
-        told = None
+        present = None
         for name in self._ids:
             path = self.path("label_2", name)
             if path.exists():
-                told = image_boxes_told(read_text(path), told)
-                if told:
+                present = image_boxes_given(read_text(path), present)
+                if present:
                     return True
-        return told is not False
+        return present is not False
 
     def _labels_of(self, path: Path, calibration: Calibration) -> Labels:
         labels = read_labels(path, calibration)
@@ -201,19 +201,19 @@ class KittiSource:
         return parse_plane(read_text(path), calibration, str(path))
 
 
-def image_boxes_told(text: str, told: bool | None = None) -> bool | None:
+def image_boxes_given(text: str, present: bool | None = None) -> bool | None:
     """Tell whether a label file's objects have boxes in the image: None (or what was known) where it has no object."""
     for line in text.splitlines():
         words = line.split()
         if len(words) >= 8 and words[0].lower() != DONT_CARE.lower():
-            told = False
+            present = False
             try:
                 left, top, right, bottom = map(float, words[4:8])
             except ValueError:
                 return True  # whoever reads the labels says what is wrong
             if right > left and bottom > top:
                 return True
-    return told
+    return present
 
 
 def _frame_folder(root: Path, part: str) -> Path:

@@ -107,8 +107,8 @@ def _fault(calibration: Calibration) -> str | None:
             rows = "; ".join(" ".join(f"{value:.4g}" for value in row) for row in rotation.tolist())
             return f"expected rotations in `R0_rect` and `Tr_velo_to_cam`, but `{name}` has {rows}"
     if float(shift.abs().max()) > FARTHEST_CAMERA:
-        told = " ".join(f"{value:.4g}" for value in shift.tolist())
-        return f"expected metres in `Tr_velo_to_cam`, but it shifts by {told}; are these millimetres?"
+        details = " ".join(f"{value:.4g}" for value in shift.tolist())
+        return f"expected metres in `Tr_velo_to_cam`, but it shifts by {details}; are these millimetres?"
     focal = calibration.p2[0, 0], calibration.p2[1, 1]
     depth = calibration.p2[2, :3]
     if not (min(focal) > 0 and float((depth - torch.tensor([0.0, 0, 1])).abs().max()) <= ASKEW):
@@ -119,16 +119,16 @@ def _fault(calibration: Calibration) -> str | None:
     whole = calibration.r0 @ turn
     ahead, up = math.cos(math.radians(ACROSS)), whole @ torch.tensor([0.0, 0, 1], dtype=whole.dtype)
     if float(-up[1]) < ahead:
-        told = " ".join(f"{value:.2f}" for value in up.tolist())
+        details = " ".join(f"{value:.2f}" for value in up.tolist())
         return (
             f"`Tr_velo_to_cam` must lead from the LiDAR (x forward, y left, z up) to the camera (x right, y down, "
-            f"z forward), but it turns up into {told} instead of 0 -1 0; a placeholder is 0 -1 0 0 0 0 -1 0 1 0 0 0"
+            f"z forward), but it turns up into {details} instead of 0 -1 0; a placeholder is 0 -1 0 0 0 0 -1 0 1 0 0 0"
         )
     if float(whole[2, 0]) < ahead:
-        told = " ".join(f"{value:.2f}" for value in whole[:, 0].tolist())
+        details = " ".join(f"{value:.2f}" for value in whole[:, 0].tolist())
         return (
             f"the camera must look along the LiDAR's x within {ACROSS:.0f} degrees, since KITTI's headings are turned "
-            f"by it, but forward becomes {told} instead of 0 0 1; turn the points so that x leads forward"
+            f"by it, but forward becomes {details} instead of 0 0 1; turn the points so that x leads forward"
         )
     return None
 

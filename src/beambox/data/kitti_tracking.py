@@ -1,4 +1,4 @@
-"""KITTI's tracking text: one file a drive, ``frame id type`` and then the columns of an object label [and a score]."""
+"""KITTI's tracking text: one file per drive, ``frame id type``, then the columns of an object label [and a score]."""
 
 from __future__ import annotations
 

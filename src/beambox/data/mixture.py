@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beambox.checks import BeamboxError, expect_same_length
+from beambox.data.sampling import shuffled_indices
 from beambox.data.source import FrameSource
-from beambox.data.walk import walk
 from beambox.structures import Frame
 
 __all__ = ["MixedSource"]
@@ -53,7 +53,7 @@ class MixedSource:
             index -= len(source)
         raise IndexError(index)
 
-    def order(self, seed: int, epoch: int) -> np.ndarray:
+    def epoch_indices(self, seed: int, epoch: int) -> np.ndarray:
         """Return the frames of an epoch, shuffled: a pure function of its arguments.
 
         Each source is walked through, so that none of its frames repeats before all came.
@@ -65,7 +65,7 @@ class MixedSource:
         counts = np.diff(ends, prepend=0)
         first = np.cumsum(sizes) - sizes
         parts = [
-            first[k] + walk(int(sizes[k]), epoch * count, count, (seed, ORDER, k))
+            first[k] + shuffled_indices(int(sizes[k]), epoch * count, count, (seed, ORDER, k))
             for k, count in enumerate(counts.tolist())
             if count
         ]

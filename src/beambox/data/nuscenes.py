@@ -6,7 +6,7 @@
       v1.0-mini/ (or v1.0-trainval/, v1.0-test/)   scene.json sample.json sample_data.json sample_annotation.json ...
       samples/LIDAR_TOP/*.pcd.bin                  float32 x, y, z, intensity (0 to 255), ring
       sweeps/LIDAR_TOP/*.pcd.bin                   between key frames
-      ImageSets/train.txt                          optional: scene names of a split, one a line
+      ImageSets/train.txt                          optional: scene names of a split, one per line
 
 The sensor's x leads right and y forward; frames here have x forward and y left. Boxes of nuScenes stand in a global
 frame with sizes w, l, h and quaternions w, x, y, z.

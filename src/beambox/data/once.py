@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.names import NameList
-from beambox.data.reading import read_frame
+from beambox.data.read_points import read_frame
 from beambox.io import check_file_name, read_json, read_names, write_bytes, write_text
 from beambox.structures import Frame, Labels
 
@@ -41,7 +41,7 @@ class _Sequence:
     """What is kept of one sequence's file; F frames, N boxes in all of them."""
 
     names: NameList  # F
-    labelled: NDArray[np.bool_]  # (F,)
+    labeled: NDArray[np.bool_]  # (F,)
     counts: NDArray[np.int64]  # (F,) boxes
     boxes: NDArray[np.float32]  # (N, 7)
     classes: NDArray[np.int16]  # (N,) position in the source's class names
@@ -50,7 +50,7 @@ class _Sequence:
         """Leave frames out."""
         rows = np.repeat(keep, self.counts)
         names = NameList([name for name, kept in zip(self.names, keep) if kept])
-        return _Sequence(names, self.labelled[keep], self.counts[keep], self.boxes[rows], self.classes[rows])
+        return _Sequence(names, self.labeled[keep], self.counts[keep], self.boxes[rows], self.classes[rows])
 
 
 class OnceSource:
@@ -65,7 +65,7 @@ class OnceSource:
         split: str = "train",
         *,
         mapping: Mapping[str, str | None] | None = None,
-        labelled: bool = True,
+        labeled: bool = True,
         keep_empty: bool = False,
         intensity_scale: float | None = None,
     ) -> None:
@@ -75,7 +75,7 @@ class OnceSource:
             root: the folder that holds ImageSets/ and data/.
             split: name of a list in ImageSets/; "all" is every sequence of data/.
             mapping: class in the files -> class wanted, None to leave it out; without it ONCE's five classes.
-            labelled: leave out frames without a box, as the public toolbox does, in val too; False keeps every frame.
+            labeled: leave out frames without a box, as the public toolbox does, in val too; False keeps every frame.
             keep_empty: of the labelled frames, keep those without a box as well.
             intensity_scale: factor for intensity, found from the numbers where None, as on every path; the public
                 toolbox takes it as it is (1.0).
@@ -90,8 +90,8 @@ class OnceSource:
         self.mapping = {name: name for name in ONCE_CLASSES} if mapping is None else dict(mapping)
         self.classes = tuple(dict.fromkeys(name for name in self.mapping.values() if name is not None))
         self.sequences = _sequence_names(self.root, split)
-        parts = [self._select(name, labelled, keep_empty) for name in self.sequences]
-        self._labelled = np.concatenate([part.labelled for part in parts])
+        parts = [self._select(name, labeled, keep_empty) for name in self.sequences]
+        self._labeled = np.concatenate([part.labeled for part in parts])
         self._sequence = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.names) for part in parts])
         self._start = np.concatenate(([0], np.cumsum(np.concatenate([part.counts for part in parts]))))
         self._boxes = np.concatenate([part.boxes for part in parts])
@@ -99,7 +99,7 @@ class OnceSource:
         self._files = NameList.join([part.names for part in parts])
         self._ids = self._files if self._files.first_repeated() is None else self._qualified()
         if not len(self._files):
-            what = "labelled frames with boxes" if labelled else "frames"
+            what = "labelled frames with boxes" if labeled else "frames"
             raise BeamboxError(
                 f'the split "{split}" of {self.root} has no {what}; for sweeps nobody labelled pass labelled=False'
             )
@@ -133,7 +133,7 @@ class OnceSource:
 
     def labels(self, index: int) -> Labels | None:
         """Labels of a frame, in ONCE's axes; None where nobody labelled it. Reads nothing."""
-        if not self._labelled[index]:
+        if not self._labeled[index]:
             return None
         index = index % len(self)
         rows = slice(self._start[index], self._start[index + 1])
@@ -143,11 +143,11 @@ class OnceSource:
     def _json(self, sequence: str) -> Path:
         return self.root / "data" / sequence / f"{sequence}.json"
 
-    def _select(self, name: str, labelled: bool, keep_empty: bool) -> _Sequence:
+    def _select(self, name: str, labeled: bool, keep_empty: bool) -> _Sequence:
         part = _read_sequence(self._json(name), self.mapping, self.classes)
-        if not labelled:
+        if not labeled:
             return part
-        return part.only(part.labelled & (keep_empty | (part.counts > 0)))
+        return part.only(part.labeled & (keep_empty | (part.counts > 0)))
 
     def _qualified(self) -> NameList:
         return NameList(f"{self.sequences[s]}_{name}" for s, name in zip(self._sequence, self._files))
@@ -177,7 +177,7 @@ def _read_sequence(path: Path, mapping: Mapping[str, str | None], classes: Seque
     if not isinstance(frames, list):
         raise BeamboxError(f"{path}: expected a list under the key `frames`, got {type(frames).__name__}")
     place = {name: k for k, name in enumerate(classes)}
-    names, labelled, counts, boxes, codes = [], [], [], [], []
+    names, labeled, counts, boxes, codes = [], [], [], [], []
     for number, frame in enumerate(frames):
         where = f"{path}, frames[{number}]"
         if not isinstance(frame, dict) or "frame_id" not in frame:
@@ -185,7 +185,7 @@ def _read_sequence(path: Path, mapping: Mapping[str, str | None], classes: Seque
         named = frame["frame_id"]
         names.append(check_file_name(str(named) if isinstance(named, int) else named, where))
         annotations = frame.get("annos")
-        labelled.append(annotations is not None)
+        labeled.append(annotations is not None)
         if annotations is None:
             counts.append(0)
             continue
@@ -197,7 +197,7 @@ def _read_sequence(path: Path, mapping: Mapping[str, str | None], classes: Seque
         codes += [place[name] for name in wanted if name is not None]
     return _Sequence(
         NameList(names),
-        np.array(labelled, dtype=np.bool_),
+        np.array(labeled, dtype=np.bool_),
         np.array(counts, dtype=np.int64),
         np.concatenate([np.zeros((0, 7), dtype=np.float32), *boxes]),
         np.array(codes, dtype=np.int16),

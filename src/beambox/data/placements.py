@@ -12,9 +12,9 @@ from torch import Tensor
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.structures import Frame
 
-__all__ = ["AS_LABELLED", "BEYOND_A_TURN", "MISTAKES", "count_filled", "up_axis"]
+__all__ = ["AS_LABELED", "BEYOND_A_TURN", "MISTAKES", "count_filled", "up_axis"]
 
-AS_LABELLED = "as labelled"
+AS_LABELED = "as labelled"
 BEYOND_A_TURN = 2 * math.pi + 0.05
 """No angle in radians needs to be larger than this."""
 FILLED = 5
@@ -78,13 +78,13 @@ def count_filled(frame: Frame) -> dict[str, tuple[int, int]]:
 
     Returns:
         Boxes with at least a few points above the ground, and such points in all, by the names of :data:`MISTAKES` and
-        :data:`AS_LABELLED`.
+        :data:`AS_LABELED`.
     """
     assert frame.labels is not None
     given = frame.labels.boxes.double()
     xyz = frame.points[:, :3].double()
     found = {}
-    for name, change in {AS_LABELLED: lambda boxes: boxes, **{name: one[0] for name, one in MISTAKES.items()}}.items():
+    for name, change in {AS_LABELED: lambda boxes: boxes, **{name: one[0] for name, one in MISTAKES.items()}}.items():
         boxes = change(given).clone()
         scale = 1e3 if name == "times 1000" else 1.0
         boxes[:, 2] += scale * ABOVE_GROUND / 2

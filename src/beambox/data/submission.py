@@ -108,7 +108,7 @@ def write_submission(
     """Pack result files into the archive that KITTI's server expects: ``data/000000.txt`` and so on.
 
     Args:
-        results: folder of result files, one a frame.
+        results: folder of result files, one per frame.
         out: the .zip file to write; the same files always give the same bytes.
         frames: names of the split's frames.
         need_alpha: see :func:`check_results`.
@@ -123,8 +123,8 @@ def write_submission(
     faults = list(check_results(results, frames, need_alpha=need_alpha))
     if faults:
         more = f"\n  and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
-        told = "\n  ".join(faults[:SHOWN])
-        raise BeamboxError(f"{results} cannot be submitted, {len(faults)} faults:\n  {told}{more}")
+        details = "\n  ".join(faults[:SHOWN])
+        raise BeamboxError(f"{results} cannot be submitted, {len(faults)} faults:\n  {details}{more}")
     with replacing(out) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in frames:
             entry = zipfile.ZipInfo(f"data/{name}.txt")  # dated 1980: the bytes depend on the content alone

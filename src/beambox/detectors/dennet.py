@@ -27,7 +27,7 @@ Where the paper is silent or contradicts itself (``docs/dennet.md`` tells each a
 * every stage of the 2-D network "starts with a 2x downsampled convolution": strides 1 and 2, as Voxel R-CNN's code;
 * counted are centres of occupied voxels ("voxel-filtered point cloud") around such centres, the voxel itself included,
   without a limit, as ln(1 + n) / ln(1 + N), N voxels in a full disc; the paper names no normalisation (``count_set``,
-  ``normalisation``, ``max_count``, ``own_points``);
+  ``normalization``, ``max_count``, ``own_points``);
 * "light 3-D sparse convolution, kernel 3, stride 2, depth 16": three layers, as one does not reach stride 8;
 * the NA module's figure is lost: a NAT block (layer norms, MLP of ratio 3, 2 and 4 heads of 32);
 * coordinate attention as published, with max(8, C / 32) hidden channels;
@@ -51,8 +51,8 @@ from beambox.detectors.voxel_rcnn import (
     COARSE_POOLING,
     FINE_POOLING,
     TwoStage,
-    VoxelRcnnConfig,
-    VoxelRcnnPredictions,
+    VoxelRCNNConfig,
+    VoxelRCNNPredictions,
 )
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, ONCE_ANCHORS, AnchorClass
@@ -67,7 +67,7 @@ from beambox.layers.bev import (
 )
 from beambox.layers.encoders import mean_voxels
 from beambox.layers.heads import PostProcess
-from beambox.layers.roi import ProposalLimits
+from beambox.layers.roi import NmsConfig
 from beambox.layers.roi_pool import PoolLevel
 from beambox.layers.sparse import levels_left, sparse_block
 from beambox.ops.ball_count import ball_counts
@@ -92,10 +92,10 @@ __all__ = [
     "DensityBranch",
     "NeighborhoodAttention",
     "NeighborhoodBlock",
-    "Normalisation",
+    "Normalization",
     "count_points",
     "dennet",
-    "normalised",
+    "normalized",
     "patch_cells",
 ]
 
@@ -113,7 +113,7 @@ class CountSet(str, Enum):
     """Points kept in voxels."""
 
 
-class Normalisation(str, Enum):
+class Normalization(str, Enum):
     """What a count n becomes; N is the number of voxels in a flat, fully occupied disc of the same radius."""
 
     LOG_SHARE = "log-share"
@@ -136,11 +136,11 @@ class AttentionPosition(str, Enum):
 
 
 @dataclass(frozen=True)
-class DenNetConfig(VoxelRcnnConfig):
+class DenNetConfig(VoxelRCNNConfig):
     """Everything that defines the network; the defaults are the published KITTI setting with three classes."""
 
     anchors: tuple[AnchorClass, ...] = KITTI_ANCHORS
-    """One anchor shape a class; also the classes and their order."""
+    """One anchor shape per class; also the classes and their order."""
     grid: VoxelGrid = DENNET_VOXELS
     """Region and voxel size in metres (DenNet, section 4.1)."""
     pooling: tuple[PoolLevel, ...] = COARSE_POOLING
@@ -153,7 +153,7 @@ class DenNetConfig(VoxelRcnnConfig):
     """Channels of the density branch's convolutions (DenNet, section 3.2.2)."""
     count_set: CountSet = CountSet.VOXELS
     """What is counted."""
-    normalisation: Normalisation = Normalisation.LOG_SHARE
+    normalization: Normalization = Normalization.LOG_SHARE
     """What becomes of a count (not in the paper)."""
     max_count: int | None = None
     """Counts stop here, as those of a ball query that gathers so many; None counts all (not in the paper)."""
@@ -194,7 +194,7 @@ ONCE = DenNetConfig(
     anchors=ONCE_ANCHORS,
     grid=ONCE_VOXELS,
     max_voxels=60000,
-    test_proposals=ProposalLimits(1024, 100, 0.7),
+    test_proposals=NmsConfig(1024, 100, 0.7),
     post=PostProcess(score_threshold=0.1, nms_iou=0.01),
 )
 """ONCE, five classes, voxels of 0.1 x 0.1 x 0.2 m (DenNet, section 4.1)."""
@@ -203,7 +203,7 @@ ONCE = DenNetConfig(
 class DenNet(TwoStage):
     """The network; see :class:`DenNetConfig`.
 
-    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`VoxelRcnnPredictions`. With all three switches
+    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`VoxelRCNNPredictions`. With all three switches
     off it is Voxel R-CNN.
     """
 
@@ -217,7 +217,7 @@ class DenNet(TwoStage):
                 config.radii,
                 config.density_depth,
                 config.count_set,
-                config.normalisation,
+                config.normalization,
                 config.max_count,
                 config.max_points if config.own_points else None,
                 config.density_collapse,
@@ -227,7 +227,7 @@ class DenNet(TwoStage):
 
     def forward(
         self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
-    ) -> VoxelRcnnPredictions:
+    ) -> VoxelRCNNPredictions:
         """Predict over the configured region, or over ``grid``, which must have cells of the same size.
 
         With ``labels`` the second stage looks at regions drawn to learn from, without at the best proposals.
@@ -244,7 +244,7 @@ class DenNet(TwoStage):
         rois, targets = self.regions(first, labels)  # R boxes
         pooled = self.roi_pool(rois, self.levels(stages), grid)  # (R, 6 * 6 * 6 * 96)
         refined = self.roi_head(pooled)
-        return VoxelRcnnPredictions(first, rois, refined, targets)
+        return VoxelRCNNPredictions(first, rois, refined, targets)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
@@ -256,27 +256,27 @@ class DenNet(TwoStage):
 
 
 def patch_cells(radius: float, cell: Sequence[float]) -> float:
-    """Return N, the area of a disc over that of a voxel seen from above."""
+    """Return N, the area of a disc over that of a voxel in BEV."""
     return math.pi * radius * radius / (cell[0] * cell[1])
 
 
-def normalised(count: Tensor, radius: float, cell: Sequence[float], how: Normalisation | str) -> Tensor:
+def normalized(count: Tensor, radius: float, cell: Sequence[float], how: Normalization | str) -> Tensor:
     """Turn counts ``(V,)`` within a radius into float32 features ``(V,)``."""
-    how = chosen("how", how, Normalisation)
+    how = chosen("how", how, Normalization)
     count, full = count.float(), patch_cells(radius, cell)
-    if how is Normalisation.LOG_SHARE:
+    if how is Normalization.LOG_SHARE:
         return torch.log1p(count) / math.log1p(full)
-    if how is Normalisation.LOG:
+    if how is Normalization.LOG:
         return torch.log1p(count)
-    return count / full if how is Normalisation.SHARE else count
+    return count / full if how is Normalization.SHARE else count
 
 
-def count_points(centres: Tensor, of_centre: Tensor, points: Tensor, of_point: Tensor, radius: float) -> Tensor:
+def count_points(centers: Tensor, of_center: Tensor, points: Tensor, of_point: Tensor, radius: float) -> Tensor:
     """Count the points of the same sample within a radius of each centre; exact, in float64.
 
     Args:
-        centres: ``(V, 3)``.
-        of_centre: ``(V,)`` int64 sample of each.
+        centers: ``(V, 3)``.
+        of_center: ``(V,)`` int64 sample of each.
         points: ``(K, 3)``.
         of_point: ``(K,)`` int64 sample of each.
         radius: metres.
@@ -284,16 +284,16 @@ def count_points(centres: Tensor, of_centre: Tensor, points: Tensor, of_point: T
     Returns:
         ``(V,)`` int64.
     """
-    count = torch.zeros(len(centres), dtype=torch.int64, device=centres.device)
+    count = torch.zeros(len(centers), dtype=torch.int64, device=centers.device)
     reach = radius + 1e-3
-    for sample in of_centre.unique().tolist():
-        rows = torch.nonzero(of_centre == sample)[:, 0]
-        rows = rows[centres[rows, 0].argsort()]
+    for sample in of_center.unique().tolist():
+        rows = torch.nonzero(of_center == sample)[:, 0]
+        rows = rows[centers[rows, 0].argsort()]
         cloud = points[of_point == sample].double()
         cloud = cloud[cloud[:, 0].argsort()]
         x = cloud[:, 0].contiguous()
         for some in rows.split(VOXELS_AT_ONCE):  # neighbours in x, so only a strip of points can be near
-            near = centres[some].double()
+            near = centers[some].double()
             edges = torch.stack((near[0, 0] - reach, near[-1, 0] + reach))
             first, last = torch.searchsorted(x, edges).tolist()
             squared = (near[:, None] - cloud[None, first:last]).square().sum(dim=2)  # (R, S)
@@ -313,7 +313,7 @@ class DensityBranch(nn.Module):
         radii: Sequence[float] = (0.6, 1.8),
         depth: int = 16,
         count_set: CountSet | str = CountSet.VOXELS,
-        normalisation: Normalisation | str = Normalisation.LOG_SHARE,
+        normalization: Normalization | str = Normalization.LOG_SHARE,
         max_count: int | None = None,
         own_points: int | None = None,
         collapse: bool = False,
@@ -324,7 +324,7 @@ class DensityBranch(nn.Module):
             radii: metres, one channel each.
             depth: channels of each convolution.
             count_set: what is counted.
-            normalisation: what becomes of a count.
+            normalization: what becomes of a count.
             max_count: counts stop here, as in a ball query that gathers so many; None counts all.
             own_points: the most points a voxel keeps, to add a channel for those it has; None for no such channel.
             collapse: halve the height once more by a further convolution.
@@ -336,7 +336,7 @@ class DensityBranch(nn.Module):
             raise BeamboxError(f"`max_count` must be at least 1 (a voxel counts itself), or none; got {max_count}")
         self.radii = tuple(radii)
         self.count_set = chosen("count_set", count_set, CountSet)
-        self.normalisation = chosen("normalisation", normalisation, Normalisation)
+        self.normalization = chosen("normalisation", normalization, Normalization)
         self.max_count = max_count
         self.own_points = own_points
         self.depth = depth
@@ -369,7 +369,7 @@ class DensityBranch(nn.Module):
         """Return each voxel's densities ``(V, radii)``, and with ``own_points`` its own, in the order of ``sites``."""
         cell = voxels.grid.cell
         counts = self.counts(sites, voxels).unbind(dim=1)
-        columns = [normalised(count, r, cell, self.normalisation) for count, r in zip(counts, self.radii)]
+        columns = [normalized(count, r, cell, self.normalization) for count, r in zip(counts, self.radii)]
         if self.own_points is not None:
             row = torch.searchsorted(sites.sorted_keys, linear_keys(voxels.index, sites.shape))
             own = torch.empty(len(sites), device=voxels.count.device)
@@ -384,9 +384,9 @@ class DensityBranch(nn.Module):
             extent = (sites.batch_size, *sites.shape)
             count = ball_counts(sites.indices, voxels.grid.cell, self.radii, extent)
         else:
-            centres = voxels.grid.centre(sites.indices[:, 1:])
+            centers = voxels.grid.center(sites.indices[:, 1:])
             points, of_point, sample = voxels.points[:, :3], voxels.index[voxels.voxel, 0], sites.indices[:, 0]
-            count = [count_points(centres, sample, points, of_point, radius) for radius in self.radii]
+            count = [count_points(centers, sample, points, of_point, radius) for radius in self.radii]
             count = torch.stack(count, dim=1)
         return count if self.max_count is None else count.clamp(max=self.max_count)
 
@@ -505,7 +505,7 @@ class NeighborhoodBlock(nn.Module):
 
 
 class CoordinateAttention(nn.Module):
-    """Weigh ``(B, C, H, W)`` by two gates, one a channel and row and one a channel and column.
+    """Weigh ``(B, C, H, W)`` by two gates, one per channel and row and one per channel and column.
 
     Rows and columns are averaged over the whole map, so the answer at a place depends on the region.
     """

@@ -16,7 +16,7 @@ Where the paper is silent or contradicts itself (``docs/hcnet.md`` tells each at
 * range: 70.4 x 80 m as printed does not fit 496 x 432 cells of 0.16 m (printed "90.16, 0.16, 10"); PointPillars'
   69.12 x 79.36 m does;
 * the voxel network is only called "similar to PointNet": PointPillars' with 64 channels, shared by all slices, at most
-  32 points a voxel;
+  32 points per voxel;
 * the product of the two attentions, "matrix multiplication", is read pixel by pixel: (C, 1) x (1, P); each pair of
   1 x 1 convolutions has a ReLU between them and 4 or 16 hidden channels (without it they would be one linear map).
   Weights lie in [0.5, 1), as a sigmoid follows two ReLUs;
@@ -31,7 +31,7 @@ Where the paper is silent or contradicts itself (``docs/hcnet.md`` tells each at
 * optimiser, length of training, flip and post-processing are missing: PointPillars' of the public toolbox (recipes).
 
 Added: ``attention`` none (a plain maximum, which the paper's tables lack), any number of slices, several classes,
-``centred_anchors`` and ``absolute_xy`` as in PointPillars.
+``centered_anchors`` and ``absolute_xy`` as in PointPillars.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
 __all__ = [
+    "CBAM",
     "HCNET_CAR",
     "HCNET_SLICES",
     "AdaptiveAdjustment",
-    "Cbam",
     "Gate",
     "HCNet",
     "HCNetConfig",
@@ -112,19 +112,23 @@ class Gate(str, Enum):
     """Sum of the convolutions, then one sigmoid: weights between 0 and 1."""
 
 
+NAMES_SINCE = {f"adapt.{fuse}.weigh.": f"adapt.{fuse}.reweight." for fuse in ("fuse1", "fuse2")}
+"""What began the names of tensors in 0.1.0 -> what begins them now."""
+
+
 @dataclass(frozen=True)
 class HCNetConfig:
     """Everything that defines the network; the defaults are the published KITTI setting, cars only."""
 
     anchors: tuple[AnchorClass, ...] = (HCNET_CAR,)
-    """One anchor shape a class; also the classes and their order."""
+    """One anchor shape per class; also the classes and their order."""
     grid: VoxelGrid = HCNET_SLICES
     """Region in metres and voxel size; the number of cells in z is the number of pseudo images P."""
     max_points: int = 32
     """Points kept in a voxel, in scan order."""
     max_voxels: int | None = 60000
     """Voxels kept in a sweep, in order of first appearance; None keeps all."""
-    columns: int = 4
+    num_point_features: int = 4
     """Values of a point: x, y, z, intensity, ..."""
     voxel_channels: int = 64
     """Width C of the voxel features and pseudo images."""
@@ -158,7 +162,7 @@ class HCNetConfig:
     """Whether the adaptive-adjustment module weighs the head's map (table 4)."""
     aam_gate: Gate = Gate.RELU
     """From convolutions to weights in it: relu (as published) or sigmoid."""
-    centred_anchors: bool = False
+    centered_anchors: bool = False
     """Whether anchors stand at the centres of the map's cells."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses (section 3.7: loc 2, cls 1, dir 0.2)."""
@@ -174,7 +178,7 @@ class HCNetConfig:
         of_stages = {"depths": self.depths, "strides": self.strides, "widths": self.widths, "up_widths": self.up_widths}
         for name, values in of_stages.items():
             if len(values) != 3:
-                raise BeamboxError(f"`{name}` must have 3 entries, one a stage, got {len(values)}: {list(values)}")
+                raise BeamboxError(f"`{name}` must have 3 entries, one per stage, got {len(values)}: {list(values)}")
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -199,8 +203,8 @@ class HCNet(nn.Module):
         super().__init__()
         self.config = config
         width = config.voxel_channels
-        self.anchors = AnchorGrid(config.anchors, config.grid, config.strides[0], config.centred_anchors)
-        self.voxel_net = PillarFeatures(width, config.columns, config.absolute_xy)
+        self.anchors = AnchorGrid(config.anchors, config.grid, config.strides[0], config.centered_anchors)
+        self.voxel_net = PillarFeatures(width, config.num_point_features, config.absolute_xy)
         self.fuse_slices = HeightChannelFusion(
             width, config.slices, config.attention, config.height_hidden, config.channel_hidden
         )
@@ -245,7 +249,7 @@ class HCNet(nn.Module):
         config = self.config
         if grid.size[2] != config.slices:
             raise BeamboxError(f"`grid` must have the {config.slices} height slices of the network, got {grid.size[2]}")
-        points = batch.points[:, : config.columns]
+        points = batch.points[:, : config.num_point_features]
         return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
 
     def loss(self, predictions: AnchorPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
@@ -263,7 +267,7 @@ def pillar_stacks(features: Tensor, voxels: Voxels) -> tuple[Tensor, Tensor]:
     """Put the voxels that stand above each other side by side; only pillars that hold a voxel appear.
 
     Args:
-        features: ``(V, C)`` one row a voxel.
+        features: ``(V, C)`` one row per voxel.
         voxels: what they describe, on a grid of N height slices.
 
     Returns:
@@ -320,7 +324,7 @@ STACK_BACKENDS = (
 def pseudo_images(features: Tensor, voxels: Voxels) -> Tensor:
     """Lay each height slice onto its own image, zero elsewhere (HCNet, section 3.2): ``(B, C, H, W, N)``.
 
-    At HCNet's published size this is 219 MB a sweep; the network uses :func:`pillar_stacks`.
+    At HCNet's published size this is 219 MB per sweep; the network uses :func:`pillar_stacks`.
     """
     nx, ny, slices = voxels.grid.size
     images = []
@@ -354,8 +358,8 @@ class HeightChannelFusion(nn.Module):
         self.slices = slices
         uses_height = kind in (HeightChannelKind.HEIGHT, HeightChannelKind.BOTH)
         uses_channel = kind in (HeightChannelKind.CHANNEL, HeightChannelKind.BOTH)
-        self.height = two_pointwise(slices, height_hidden) if uses_height else None
-        self.channel = two_pointwise(channels, channel_hidden) if uses_channel else None
+        self.height = mlp(slices, height_hidden) if uses_height else None
+        self.channel = mlp(channels, channel_hidden) if uses_channel else None
 
     def forward(self, stacks: Tensor) -> Tensor:
         """Merge the slices of each pillar: ``(M, N, C)``, no value negative, to ``(M, C)``."""
@@ -388,7 +392,7 @@ class HeightChannelFusion(nn.Module):
         return weight.permute(0, 3, 1, 2, 4)
 
 
-def two_pointwise(width: int, hidden: int) -> nn.Sequential:
+def mlp(width: int, hidden: int) -> nn.Sequential:
     """Two 1 x 1 convolutions with ReLU, on the last axis; the result is at least 0.
 
     The paper names no initialisation, and PyTorch's shuts a ReLU for good in every second network: inputs are not
@@ -447,11 +451,11 @@ class OriginalFusion(nn.Module):
         steps += [conv_bn_relu(of.width, of.width, stride=stride) for stride in strides[1:]]
         self.shrink = nn.Sequential(*steps)
         self.out_channels = channels + of.width
-        self.weigh = Cbam(self.out_channels, of.reduction)
+        self.reweight = CBAM(self.out_channels, of.reduction)
 
     def forward(self, bev: Tensor, image: Tensor) -> Tensor:
         """Map ``(B, channels, Y / s, X / s)`` and the image ``(B, C, Y, X)`` to ``(B, out_channels, Y / s, X / s)``."""
-        return self.weigh(join_levels((bev, self.shrink(image))))
+        return self.reweight(join_levels((bev, self.shrink(image))))
 
 
 class AdaptiveHead(nn.Module):
@@ -489,7 +493,7 @@ class AdaptiveHead(nn.Module):
         return both if self.adjust is None else self.adjust(both)
 
 
-class Cbam(nn.Module):
+class CBAM(nn.Module):
     """Weigh channels, then places (CBAM: Woo et al., ECCV 2018, section 3).
 
     The channel weights depend on means and maxima over the whole map, so the answer at a place depends on the region.

@@ -16,9 +16,18 @@ __all__ = ["MOST_ELEMENTS", "bounded", "check_numbers"]
 
 MOST = 1_000_000
 """No count and no length of a network is larger."""
-MAY_BE_ZERO = {"d", "depths", "e", "head_depth", "m", "n", "reach", "train_least"}  # d, e, m, n: KASSD's keypoints
-"""Counts that may be 0; all others are at least 1."""
-MAY_BE_NEGATIVE = {"bottom", "maximum", "minimum"}
+MAY_BE_ZERO = {
+    "d",
+    "depths",
+    "e",
+    "head_depth",
+    "m",
+    "n",
+    "query_range",
+    "train_least",
+}
+"""Counts that may be 0 (d, e, m, n: KASSD's keypoints); all others are at least 1."""
+MAY_BE_NEGATIVE = {"bottom_z", "maximum", "minimum"}
 """Numbers that may lie below 0: places in space."""
 ABOVE_ZERO = {"radii", "radius", "size", "smooth_l1_beta"}
 """Lengths that cannot be 0."""
@@ -45,8 +54,8 @@ def check_numbers(options: Mapping[str, Any], field: str = "", place: str = "") 
         elif isinstance(value, float):
             low = -MOST if field in MAY_BE_NEGATIVE else 0
             if not low <= value <= MOST or (value == 0 and field in ABOVE_ZERO):
-                told = "above 0" if field in ABOVE_ZERO else f"of {low} to {MOST}"
-                raise BeamboxError(f"`{where}` must be a number {told}, got {value}")
+                details = "above 0" if field in ABOVE_ZERO else f"of {low} to {MOST}"
+                raise BeamboxError(f"`{where}` must be a number {details}, got {value}")
 
 
 @contextmanager
@@ -80,9 +89,9 @@ def bounded(name: str, most: int = MOST_ELEMENTS) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ArithmeticError, MemoryError) as error:  # torch's own words for a layer that cannot be
-        told = str(error).partition("\n")[0] or type(error).__name__
+        details = str(error).partition("\n")[0] or type(error).__name__
         raise BeamboxError(
-            f"these options make no {name} that can be built ({told}): check widths and depths"
+            f"these options make no {name} that can be built ({details}): check widths and depths"
         ) from error
     finally:
         for hook in hooks:

@@ -12,7 +12,7 @@ outputs are reproduced in evaluation mode from its checkpoints.
 Deviations, each switchable:
 
 * batch-norm statistics of the pillar network are those of real points, without padding rows (``empty_slots``);
-* ``centred_anchors`` puts anchors at the cells' centres, where the toolbox spreads them over the region's borders;
+* ``centered_anchors`` puts anchors at the cells' centres, where the toolbox spreads them over the region's borders;
 * ``absolute_xy`` off drops each point's absolute x and y, so that one network serves any region around the sensor.
 """
 
@@ -48,14 +48,14 @@ class PointPillarsConfig:
     """Everything that defines the network; the defaults are the published KITTI setting with three classes."""
 
     anchors: tuple[AnchorClass, ...] = KITTI_ANCHORS
-    """One anchor shape a class; also the classes and their order."""
+    """One anchor shape per class; also the classes and their order."""
     grid: VoxelGrid = KITTI_PILLARS
     """Region in metres and pillar size (PointPillars, section 3.1: 0.16 m; range of the car network)."""
     max_points: int = 32
     """Points kept in a pillar, in scan order."""
     max_voxels: int | None = 40000
     """Pillars kept in a sweep, in order of first appearance; None keeps all."""
-    columns: int = 4
+    num_point_features: int = 4
     """Values of a point: x, y, z, intensity, ..."""
     voxel_channels: int = 64
     """Width of the pillar features."""
@@ -73,7 +73,7 @@ class PointPillarsConfig:
     """Enlargement of each stage's output, to the size of the first."""
     up_widths: tuple[int, ...] = (128, 128, 128)
     """Channels of each enlarged output."""
-    centred_anchors: bool = False
+    centered_anchors: bool = False
     """Whether anchors stand at the centres of the map's cells."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses (PointPillars, equation 3: loc 2, cls 1, dir 0.2)."""
@@ -109,8 +109,8 @@ class PointPillars(nn.Module):
         super().__init__()
         self.config = config
         slots = config.max_points if config.empty_slots else None
-        self.anchors = AnchorGrid(config.anchors, config.grid, config.strides[0], config.centred_anchors)
-        self.pillar_net = PillarFeatures(config.voxel_channels, config.columns, config.absolute_xy, slots)
+        self.anchors = AnchorGrid(config.anchors, config.grid, config.strides[0], config.centered_anchors)
+        self.pillar_net = PillarFeatures(config.voxel_channels, config.num_point_features, config.absolute_xy, slots)
         self.backbone = BevBackbone(
             config.voxel_channels, config.depths, config.strides, config.widths, config.up_strides, config.up_widths
         )
@@ -140,7 +140,7 @@ class PointPillars(nn.Module):
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into pillars."""
         config = self.config
-        points = batch.points[:, : config.columns]
+        points = batch.points[:, : config.num_point_features]
         return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
 
     @staticmethod

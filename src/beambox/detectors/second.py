@@ -32,7 +32,7 @@ from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["KITTI_CAR", "KITTI_VOXELS", "ONCE", "ONCE_VOXELS", "Second", "SecondConfig", "second"]
+__all__ = ["KITTI_CAR", "KITTI_VOXELS", "ONCE", "ONCE_VOXELS", "SECOND", "SECONDConfig", "second"]
 
 STRIDE = 8
 """Voxels across one cell of the map."""
@@ -43,18 +43,18 @@ ONCE_VOXELS = VoxelGrid((-75.2, -75.2, -5.0), (75.2, 75.2, 3.0), (0.1, 0.1, 0.2)
 
 
 @dataclass(frozen=True)
-class SecondConfig:
+class SECONDConfig:
     """Everything that defines the network; the defaults are the toolbox's KITTI setting with three classes."""
 
     anchors: tuple[AnchorClass, ...] = KITTI_ANCHORS
-    """One anchor shape a class; also the classes and their order."""
+    """One anchor shape per class; also the classes and their order."""
     grid: VoxelGrid = KITTI_VOXELS
     """Region and voxel size in metres (toolbox; the paper uses 0.2 x 0.05 x 0.05 and the same range)."""
     max_points: int = 5
     """Points kept in a voxel, in scan order (toolbox)."""
     max_voxels: int | None = 40000
     """Voxels kept in a sweep, in order of first appearance; None keeps all (toolbox, at test)."""
-    columns: int = 4
+    num_point_features: int = 4
     """Values of a point: x, y, z, intensity, ..."""
     absolute_xy: bool = True
     """Whether a voxel's mean x and y are told from the sensor; else from the voxel's centre."""
@@ -72,7 +72,7 @@ class SecondConfig:
     """Enlargement of each BEV stage's output, to the size of the first."""
     up_widths: tuple[int, ...] = (256, 256)
     """Channels of each enlarged output."""
-    centred_anchors: bool = False
+    centered_anchors: bool = False
     """Whether anchors stand at the centres of the map's cells."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses (SECOND, equation 8: cls 1, loc 2, dir 0.2)."""
@@ -98,23 +98,23 @@ class SecondConfig:
         return tuple(anchor.name for anchor in self.anchors)
 
 
-KITTI_CAR = SecondConfig(anchors=KITTI_ANCHORS[:1])
+KITTI_CAR = SECONDConfig(anchors=KITTI_ANCHORS[:1])
 """KITTI, cars only."""
-ONCE = SecondConfig(anchors=ONCE_ANCHORS, grid=ONCE_VOXELS, max_voxels=60000)
+ONCE = SECONDConfig(anchors=ONCE_ANCHORS, grid=ONCE_VOXELS, max_voxels=60000)
 """ONCE, five classes (toolbox, ``once_models/second.yaml``)."""
 
 
-class Second(nn.Module):
-    """The network; see :class:`SecondConfig`.
+class SECOND(nn.Module):
+    """The network; see :class:`SECONDConfig`.
 
     ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`AnchorPredictions` over the map of stride 8.
     """
 
-    def __init__(self, config: SecondConfig) -> None:
+    def __init__(self, config: SECONDConfig) -> None:
         super().__init__()
         self.config = config
-        self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE * config.strides[0], config.centred_anchors)
-        self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
+        self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE * config.strides[0], config.centered_anchors)
+        self.encoder = VoxelEncoder(config.num_point_features, config.encoder_widths, config.encoder_out)
         self.backbone = BevBackbone(
             self.encoder.bev_channels(config.grid.shape[0]),
             config.depths,
@@ -146,7 +146,7 @@ class Second(nn.Module):
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""
         config = self.config
-        points = batch.points[:, : config.columns]
+        points = batch.points[:, : config.num_point_features]
         return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
 
     def loss(self, predictions: AnchorPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
@@ -160,6 +160,6 @@ class Second(nn.Module):
         return detections_from(select_boxes(predictions, self.config.post), self.config.classes)
 
 
-def second(config: SecondConfig | None = None) -> Second:
+def second(config: SECONDConfig | None = None) -> SECOND:
     """Build SECOND; without a configuration, the toolbox's KITTI one with three classes (5.3 M parameters)."""
-    return Second(config or SecondConfig())
+    return SECOND(config or SECONDConfig())

@@ -34,7 +34,7 @@ from beambox.layers.bev import BevBackbone
 from beambox.layers.encoders import EncoderStages, VoxelEncoder, mean_voxels
 from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss
 from beambox.layers.roi import (
-    ProposalLimits,
+    NmsConfig,
     Rois,
     RoiSampling,
     RoiTargets,
@@ -51,7 +51,7 @@ from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["KITTI", "ONCE", "TwoStage", "VoxelRcnn", "VoxelRcnnConfig", "VoxelRcnnPredictions", "voxel_rcnn"]
+__all__ = ["KITTI", "ONCE", "TwoStage", "VoxelRCNN", "VoxelRCNNConfig", "VoxelRCNNPredictions", "voxel_rcnn"]
 
 FINE_POOLING = tuple(PoolLevel(stride, (4, 4, 4), radius) for stride, radius in ((2, 0.4), (4, 0.8), (8, 1.6)))
 """Voxel RoI pooling for voxels of 0.05 m (toolbox)."""
@@ -60,18 +60,18 @@ COARSE_POOLING = tuple(PoolLevel(stride, (2, 3, 3), radius) for stride, radius i
 
 
 @dataclass(frozen=True)
-class VoxelRcnnConfig:
+class VoxelRCNNConfig:
     """Everything that defines the network; the defaults are the published KITTI setting for cars."""
 
     anchors: tuple[AnchorClass, ...] = KITTI_ANCHORS[:1]
-    """One anchor shape a class; also the classes and their order."""
+    """One anchor shape per class; also the classes and their order."""
     grid: VoxelGrid = KITTI_VOXELS
     """Region and voxel size in metres (Voxel R-CNN, section 4.1)."""
     max_points: int = 5
     """Points kept in a voxel, in scan order (toolbox)."""
     max_voxels: int | None = 40000
     """Voxels kept in a sweep, in order of first appearance; None keeps all (toolbox, at test)."""
-    columns: int = 4
+    num_point_features: int = 4
     """Values of a point: x, y, z, intensity, ..."""
     absolute_xy: bool = True
     """Whether a voxel's mean x and y are told from the sensor; else from the voxel's centre."""
@@ -89,21 +89,21 @@ class VoxelRcnnConfig:
     """Enlargement of each BEV stage's output, to the size of the first."""
     up_widths: tuple[int, ...] = (128, 128)
     """Channels of each enlarged output."""
-    centred_anchors: bool = False
+    centered_anchors: bool = False
     """Whether anchors stand at the centres of the map's cells."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the first stage's losses; those of the second weigh 1."""
     smooth_l1_beta: float = 1 / 9
     """Where the first stage's regression loss turns linear (toolbox)."""
-    train_proposals: ProposalLimits = field(default_factory=lambda: ProposalLimits(9000, 512, 0.8))
+    train_proposals: NmsConfig = field(default_factory=lambda: NmsConfig(9000, 512, 0.8))
     """Proposals in training (Voxel R-CNN, section 4.1; toolbox)."""
-    test_proposals: ProposalLimits = field(default_factory=lambda: ProposalLimits(2048, 100, 0.7))
+    test_proposals: NmsConfig = field(default_factory=lambda: NmsConfig(2048, 100, 0.7))
     """Proposals at test (Voxel R-CNN, section 4.1; toolbox)."""
     sampling: RoiSampling = field(default_factory=RoiSampling)
     """Regions that the second stage learns from (Voxel R-CNN, section 3.4)."""
     pooling: tuple[PoolLevel, ...] = FINE_POOLING
     """Levels of voxel RoI pooling, of strides 2, 4 and 8."""
-    lattice: int = 6
+    grid_size: int = 6
     """Grid points along each edge of a region (Voxel R-CNN, section 4.1)."""
     roi_width: int = 256
     """Width of the second stage's fully connected layers (toolbox)."""
@@ -132,13 +132,13 @@ class VoxelRcnnConfig:
         return tuple(anchor.name for anchor in self.anchors)
 
 
-KITTI = VoxelRcnnConfig(anchors=KITTI_ANCHORS)
+KITTI = VoxelRCNNConfig(anchors=KITTI_ANCHORS)
 """KITTI, three classes."""
-ONCE = VoxelRcnnConfig(
+ONCE = VoxelRCNNConfig(
     anchors=ONCE_ANCHORS,
     grid=ONCE_VOXELS,
     max_voxels=60000,
-    test_proposals=ProposalLimits(1024, 100, 0.7),
+    test_proposals=NmsConfig(1024, 100, 0.7),
     pooling=COARSE_POOLING,
     post=PostProcess(score_threshold=0.1, nms_iou=0.01),
 )
@@ -146,7 +146,7 @@ ONCE = VoxelRcnnConfig(
 
 
 @dataclass(frozen=True)
-class VoxelRcnnPredictions:
+class VoxelRCNNPredictions:
     """Outputs of both stages."""
 
     first: AnchorPredictions
@@ -162,15 +162,15 @@ class VoxelRcnnPredictions:
 class TwoStage(nn.Module):
     """What Voxel R-CNN shares with its successors: all but the 2-D network and what feeds it."""
 
-    def __init__(self, config: VoxelRcnnConfig) -> None:
+    def __init__(self, config: VoxelRCNNConfig) -> None:
         super().__init__()
         self.config = config
-        self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE * config.strides[0], config.centred_anchors)
-        self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
+        self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE * config.strides[0], config.centered_anchors)
+        self.encoder = VoxelEncoder(config.num_point_features, config.encoder_widths, config.encoder_out)
         self.head = AnchorHead(sum(config.up_widths), self.anchors)
         channels: dict[int, int] = dict(zip((2, 4, 8), self.encoder.stage_channels))
         self.roi_pool = VoxelRoiPool(
-            [channels[level.stride] for level in config.pooling], config.pooling, config.lattice
+            [channels[level.stride] for level in config.pooling], config.pooling, config.grid_size
         )
         self.roi_head = RoiHead(self.roi_pool.out_channels, config.roi_width, config.dropout)
 
@@ -195,10 +195,10 @@ class TwoStage(nn.Module):
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""
         config = self.config
-        points = batch.points[:, : config.columns]
+        points = batch.points[:, : config.num_point_features]
         return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
 
-    def loss(self, predictions: VoxelRcnnPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
+    def loss(self, predictions: VoxelRCNNPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
         """Return the first stage's weighted losses and the second's ``roi_cls``, ``roi_box`` and ``roi_corner``.
 
         Args:
@@ -210,23 +210,23 @@ class TwoStage(nn.Module):
         first, refined = predictions.first, predictions.refined
         boxes, classes = targets_from(labels, self.config.classes, first.cls.device)
         losses = anchor_loss(first, boxes, classes, self.anchors, self.config.loss, self.config.smooth_l1_beta)
-        return {**losses, **roi_loss(refined.cls, refined.codes, predictions.targets)}
+        return {**losses, **roi_loss(refined.cls, refined.deltas, predictions.targets)}
 
-    def decode(self, predictions: VoxelRcnnPredictions) -> list[Detections]:
+    def decode(self, predictions: VoxelRCNNPredictions) -> list[Detections]:
         """Return the detections of each sample, best first."""
         expect_made(predictions.targets is not None, wanted=False)
         rois, refined = predictions.rois, predictions.refined
-        boxes = decode_rois(refined.codes.float(), rois.boxes)
+        boxes = decode_rois(refined.deltas.float(), rois.boxes)
         return detections_from(select_rois(rois, refined.cls, boxes, self.config.post), self.config.classes)
 
 
-class VoxelRcnn(TwoStage):
-    """The network; see :class:`VoxelRcnnConfig`.
+class VoxelRCNN(TwoStage):
+    """The network; see :class:`VoxelRCNNConfig`.
 
-    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`VoxelRcnnPredictions`.
+    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`VoxelRCNNPredictions`.
     """
 
-    def __init__(self, config: VoxelRcnnConfig) -> None:
+    def __init__(self, config: VoxelRCNNConfig) -> None:
         super().__init__(config)
         self.backbone = BevBackbone(
             self.encoder.bev_channels(config.grid.shape[0]),
@@ -239,7 +239,7 @@ class VoxelRcnn(TwoStage):
 
     def forward(
         self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
-    ) -> VoxelRcnnPredictions:
+    ) -> VoxelRCNNPredictions:
         """Predict over the configured region, or over ``grid``, which must have cells of the same size.
 
         With ``labels`` the second stage looks at regions drawn to learn from, without at the best proposals.
@@ -252,7 +252,7 @@ class VoxelRcnn(TwoStage):
         rois, targets = self.regions(first, labels)  # R boxes
         pooled = self.roi_pool(rois, self.levels(stages), grid)  # (R, 6 * 6 * 6 * 96)
         refined = self.roi_head(pooled)
-        return VoxelRcnnPredictions(first, rois, refined, targets)
+        return VoxelRCNNPredictions(first, rois, refined, targets)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
@@ -260,6 +260,6 @@ class VoxelRcnn(TwoStage):
         return (self.backbone,)
 
 
-def voxel_rcnn(config: VoxelRcnnConfig | None = None) -> VoxelRcnn:
+def voxel_rcnn(config: VoxelRCNNConfig | None = None) -> VoxelRCNN:
     """Build Voxel R-CNN; without a configuration, the published one for KITTI's cars (7.6 M parameters)."""
-    return VoxelRcnn(config or VoxelRcnnConfig())
+    return VoxelRCNN(config or VoxelRCNNConfig())

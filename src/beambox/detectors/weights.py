@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import build, config_to_dict, name_of, tensors_since
+from beambox.detectors.catalog import build, config_to_dict, name_of, tensors_since
 from beambox.io import parse_json, write_bytes
 
 __all__ = ["WeightFile", "load_weights", "read_weights", "save_weights"]
@@ -62,8 +62,8 @@ def save_weights(
     """
     values = {}
     for name, value in (tensors if tensors is not None else model.state_dict()).items():
-        held = value.detach().cpu()
-        values[name] = (held.half() if half and held.is_floating_point() else held).contiguous()
+        tensor = value.detach().cpu()
+        values[name] = (tensor.half() if half and tensor.is_floating_point() else tensor).contiguous()
     header = {
         "format": FORMAT,
         "detector": name_of(model),
@@ -111,14 +111,14 @@ def load_weights(path: str | Path, device: torch.device | str = "cpu") -> nn.Mod
     """
     stored = read_weights(path)
     warn_of_licence(Path(path).stem, str(stored.card.get("licence", "")))
-    held = sum(value.numel() for value in stored.tensors.values())
+    tensor = sum(value.numel() for value in stored.tensors.values())
     # what the file does not hold is refused before it takes memory; some buffers need not be in it
-    model = build(stored.detector, stored.config, most=2 * held + 1_000_000)
+    model = build(stored.detector, stored.config, most=2 * tensor + 1_000_000)
     fill(model, stored.tensors, str(path))
     return model.to(device).eval()
 
 
-@functools.cache  # once a process
+@functools.cache  # once per process
 def warn_of_licence(name: str, licence: str) -> None:
     """Say that weights may not be used commercially, where their card does."""
     if "-NC-" in licence.upper():
@@ -134,9 +134,9 @@ def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
     own, tensors = model.state_dict(), tensors_since(model, tensors)
     missing, unknown = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
     if missing or unknown:
-        said = [f"lacks {missing[0]} and {len(missing) - 1} more"] if missing else []
-        said += [f"has {unknown[0]} and {len(unknown) - 1} more that the model does not know"] if unknown else []
-        raise BeamboxError(f"{where} does not fit this {type(model).__name__}: it {' and '.join(said)}")
+        problems = [f"lacks {missing[0]} and {len(missing) - 1} more"] if missing else []
+        problems += [f"has {unknown[0]} and {len(unknown) - 1} more that the model does not know"] if unknown else []
+        raise BeamboxError(f"{where} does not fit this {type(model).__name__}: it {' and '.join(problems)}")
     for name, value in own.items():
         if value.shape != tensors[name].shape:
             raise BeamboxError(

@@ -1,8 +1,9 @@
-"""Maps seen from above as pictures: x forward is up, y left is left, in metres."""
+"""Maps in BEV as pictures: x forward is up, y left is left, in metres."""
 
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -69,7 +70,7 @@ def draw_maps(
     axes[0].set_ylabel("x, m")
     if shown is not None:
         figure.colorbar(shown, ax=list(axes), fraction=0.03)
-    figure.suptitle(title, fontsize=10)
+    _entitle(figure, title)
     return _picture(figure)
 
 
@@ -102,8 +103,14 @@ def draw_near(
         each.set(xlim=(y + reach, y - reach), ylim=(x - reach, x + reach), aspect="equal")
         each.set_title(name, fontsize=9)
         figure.colorbar(dots, ax=each, fraction=0.045)
-    figure.suptitle(title, fontsize=10)
+    _entitle(figure, title)
     return _picture(figure)
+
+
+def _entitle(figure: Any, title: str) -> None:
+    """Put a title above all, in as many lines as the figure's width asks for."""
+    letters = round(12 * figure.get_figwidth())  # of 10 points, about so many in an inch
+    figure.suptitle("\n".join(textwrap.wrap(title, letters)), fontsize=10)
 
 
 def draw_bars(series: Sequence[tuple[str, Tensor]], title: str, label: str) -> Image.Image:

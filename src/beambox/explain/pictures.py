@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, expect_library
 from beambox.detectors.dennet import DenNet, NeighborhoodAttention
 from beambox.detectors.hcnet import HCNet, pillar_stacks
 from beambox.detectors.kassd.keypoints import map_coordinates, sample_bilinear
-from beambox.detectors.kassd.network import Kassd, KassdPredictions, LocationAttention, location_weights
+from beambox.detectors.kassd.network import KASSD, KASSDPredictions, LocationAttention, location_weights
 from beambox.detectors.second import STRIDE
 from beambox.explain.drawing import Explained, draw_bars, draw_maps, draw_near, scatter_map
 from beambox.infer.predictor import Detector
@@ -29,18 +29,19 @@ MOST = 5
 
 
 @torch.inference_mode()
-def explain(detector: Detector, frame: Frame, min_score: float = 0.3) -> list[Explained]:
+def explain(detector: Detector, frame: Frame, score_threshold: float = 0.3) -> list[Explained]:
     """Draw what a detector's attention weighs in a sweep.
 
     Args:
         detector: HCNet, KASSD or DenNet.
         frame: as given; pictures are in the network's frame.
-        min_score: detections below are not drawn.
+        score_threshold: detections below are not drawn.
 
     Raises:
         BeamboxError: for another detector, or a sweep with no point where it looks.
     """
-    drawers: dict[type, Callable[..., Iterator[Explained]]] = {HCNet: _hcnet, Kassd: _kassd, DenNet: _dennet}
+    expect_library("matplotlib", "plots", "drawing what a detector weighs")
+    drawers: dict[type, Callable[..., Iterator[Explained]]] = {HCNet: _hcnet, KASSD: _kassd, DenNet: _dennet}
     drawer = next((draw for kind, draw in drawers.items() if isinstance(detector.model, kind)), None)
     if drawer is None:
         raise BeamboxError(f"{type(detector.model).__name__} has no attention to draw; HCNet, KASSD and DenNet have")
@@ -48,7 +49,7 @@ def explain(detector: Detector, frame: Frame, min_score: float = 0.3) -> list[Ex
     if not detector.sees(prepared):
         raise BeamboxError(f"{frame.id or 'the sweep'} has no point where the network looks; beambox doctor says why")
     batch = Batch.of([prepared]).to(detector.device)
-    return list(drawer(detector, batch, min_score))
+    return list(drawer(detector, batch, score_threshold))
 
 
 @contextmanager
@@ -62,18 +63,18 @@ def _seen(module: nn.Module) -> Iterator[list[tuple[tuple[Any, ...], Any]]]:
         handle.remove()
 
 
-def _found(detector: Detector, predictions: Any, min_score: float) -> Detections:
+def _found(detector: Detector, predictions: Any, score_threshold: float) -> Detections:
     """Decode in the network's own frame."""
     found = detector.model.decode(predictions)[0].to("cpu")
-    return found[found.scores >= min_score]
+    return found[found.scores >= score_threshold]
 
 
 # ---------------------------------------------------------------- HCNet
 
 
-def _hcnet(detector: Detector, batch: Batch, min_score: float) -> Iterator[Explained]:
+def _hcnet(detector: Detector, batch: Batch, score_threshold: float) -> Iterator[Explained]:
     model, grid = detector.model, detector.grid
-    boxes = _found(detector, detector.predict(batch), min_score).boxes
+    boxes = _found(detector, detector.predict(batch), score_threshold).boxes
     voxels = model.voxels(batch, grid)
     stacks, pillars = pillar_stacks(model.voxel_net(voxels), voxels)  # (M, P, C), (M, 4)
     images = stacks.permute(2, 0, 1)[None, :, :, None, :]  # (1, C, M, 1, P): each pillar a pixel
@@ -104,11 +105,11 @@ def _hcnet(detector: Detector, batch: Batch, min_score: float) -> Iterator[Expla
 # ---------------------------------------------------------------- KASSD
 
 
-def _kassd(detector: Detector, batch: Batch, min_score: float) -> Iterator[Explained]:
+def _kassd(detector: Detector, batch: Batch, score_threshold: float) -> Iterator[Explained]:
     model, grid = detector.model, detector.grid
     with _seen(model.neck.levels if isinstance(model.neck, LocationAttention) else model.neck) as notes:
-        predictions: KassdPredictions = detector.predict(batch)
-    found = _found(detector, predictions, min_score)
+        predictions: KASSDPredictions = detector.predict(batch)
+    found = _found(detector, predictions, score_threshold)
     if isinstance(model.neck, LocationAttention) and model.neck.lam:
         high, low = notes[0][1]
         weights = location_weights(high, low, model.neck.reduce)[0, 0].float().cpu()
@@ -131,7 +132,7 @@ def _kassd(detector: Detector, batch: Batch, min_score: float) -> Iterator[Expla
         yield Explained("keypoint_scores", title, draw_near(items, points, title, reach=4.0))
 
 
-def _keypoints(model: Kassd, predictions: KassdPredictions, grid: Any, box: Tensor, kind: int) -> tuple[Tensor, Tensor]:
+def _keypoints(model: KASSD, predictions: KASSDPredictions, grid: Any, box: Tensor, kind: int) -> tuple[Tensor, Tensor]:
     """Return where a detection's keypoints lie, ``(K, 2)``, and their scores, ``(K,)``."""
     assert model.kam is not None and predictions.maps is not None
     head, options = predictions.head, model.config.kam_options
@@ -147,7 +148,7 @@ def _keypoints(model: Kassd, predictions: KassdPredictions, grid: Any, box: Tens
 # ---------------------------------------------------------------- DenNet
 
 
-def _dennet(detector: Detector, batch: Batch, min_score: float) -> Iterator[Explained]:
+def _dennet(detector: Detector, batch: Batch, score_threshold: float) -> Iterator[Explained]:
     model, grid = detector.model, detector.grid
     attention = [layer for layer in model.modules() if isinstance(layer, NeighborhoodAttention)]
     watched = [*attention, *([model.density] if model.density is not None else [])]
@@ -164,7 +165,7 @@ def _dennet(detector: Detector, batch: Batch, min_score: float) -> Iterator[Expl
     finally:
         for handle in handles:
             handle.remove()
-    found = _found(detector, predictions, min_score)
+    found = _found(detector, predictions, score_threshold)
     if model.density is not None:
         sites, voxels = notes[model.density]
         values = model.density.features(sites, voxels).cpu()  # (V, radii)
@@ -173,7 +174,7 @@ def _dennet(detector: Detector, batch: Batch, min_score: float) -> Iterator[Expl
         names = [f"within {radius:g} m" for radius in model.density.radii]
         names += ["of the voxel itself"] * (values.shape[1] - len(names))
         maps = [(name, scatter_map(values[:, k], rows, columns, shape)) for k, name in enumerate(names)]
-        title = f"DenNet: density of each voxel ({model.density.normalisation.value}), the largest of each column"
+        title = f"DenNet: density of each voxel ({model.density.normalization.value}), the largest of each column"
         yield Explained("densities", title, draw_maps(maps, grid, found.boxes, title))
     points = batch.points.cpu()
     for number, layer in enumerate(attention, start=1):

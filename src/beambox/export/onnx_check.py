@@ -153,10 +153,12 @@ def opened(content: bytes) -> Any:
 
 def read_about(session: Any) -> dict[str, Any]:
     """Return what a file says of itself in its metadata; ``session`` is an ``onnxruntime.InferenceSession``."""
-    held = session.get_modelmeta().custom_metadata_map
-    if "beambox" not in held:
-        raise BeamboxError(f'expected a file that beambox exported, with "beambox" in its metadata, got {sorted(held)}')
-    return parse_json(held["beambox"], "its metadata")
+    metadata = session.get_modelmeta().custom_metadata_map
+    if "beambox" not in metadata:
+        raise BeamboxError(
+            f'expected a file that beambox exported, with "beambox" in its metadata, got {sorted(metadata)}'
+        )
+    return parse_json(metadata["beambox"], "its metadata")
 
 
 def gathered(about: dict[str, Any], points: Tensor) -> Voxels:

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from beambox import __version__
 from beambox.checks import BeamboxError, how_to_install
-from beambox.detectors.catalogue import config_to_dict, name_of
+from beambox.detectors.catalog import config_to_dict, name_of
 from beambox.detectors.hcnet import HCNet
 from beambox.detectors.pointpillars import PointPillars
 from beambox.export.onnx_check import TOLERANCE, Differences, compare, runtime_is_there, synthetic_sweep
@@ -121,7 +121,9 @@ def export_onnx(
     content = proto.SerializeToString()
     checks = []
     if runtime_is_there():
-        everything = {"built-in sweep": synthetic_sweep(grid or detector.config.grid, detector.config.columns)}
+        everything = {
+            "built-in sweep": synthetic_sweep(grid or detector.config.grid, detector.config.num_point_features)
+        }
         for name, points in {**everything, **(sweeps or {})}.items():
             checks.append(compare(content, detector, points, name))
             expect_agreement(checks[-1])
@@ -143,7 +145,7 @@ def traced(graph: DenseGraph, opset: int) -> Any:
     """Trace a graph into an ``onnx.ModelProto`` with any number of points and voxels, weights inside."""
     count, cells = torch.export.Dim("N"), torch.export.Dim("V")
     example = (
-        torch.zeros(5, graph.detector.config.columns),
+        torch.zeros(5, graph.detector.config.num_point_features),
         torch.tensor([0, 0, 1, 1, 2]),
         torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 1]]),
     )
@@ -191,7 +193,7 @@ def described(detector: PointPillars | HCNet, grid: VoxelGrid, card: Mapping[str
         "beambox": __version__,
         "detector": name_of(detector),
         "classes": list(config.classes),
-        "columns": config.columns,
+        "columns": config.num_point_features,
         "grid": asdict(grid),
         "cells": list(grid.size),
         "max_points": config.max_points,
@@ -215,10 +217,10 @@ def shapes(values: Any) -> dict[str, str]:
     """Write the shapes and types of a graph's inputs or outputs."""
     import onnx
 
-    told = {}
+    signature = {}
     for value in values:
         tensor = value.type.tensor_type
         sizes = ", ".join(dim.dim_param or str(dim.dim_value) for dim in tensor.shape.dim)
         kind = onnx.helper.tensor_dtype_to_np_dtype(tensor.elem_type).name
-        told[value.name] = f"({sizes}) {kind}"
-    return told
+        signature[value.name] = f"({sizes}) {kind}"
+    return signature

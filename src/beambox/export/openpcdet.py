@@ -21,11 +21,11 @@ from torch import Tensor, nn
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean, printable
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
-from beambox.detectors.second import KITTI_CAR, SecondConfig, second
+from beambox.detectors.second import KITTI_CAR, SECONDConfig, second
 from beambox.detectors.second import ONCE as SECOND_ONCE
 from beambox.detectors.voxel_rcnn import KITTI as VOXEL_RCNN_KITTI
 from beambox.detectors.voxel_rcnn import ONCE as VOXEL_RCNN_ONCE
-from beambox.detectors.voxel_rcnn import VoxelRcnnConfig, voxel_rcnn
+from beambox.detectors.voxel_rcnn import VoxelRCNNConfig, voxel_rcnn
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import ONCE_ANCHORS
 
@@ -45,14 +45,14 @@ def pointpillars_names(config: PointPillarsConfig) -> Names:
     yield from head_names()
 
 
-def second_names(config: SecondConfig) -> Names:
+def second_names(config: SECONDConfig) -> Names:
     """Name SECOND's layers."""
     yield from encoder_names()
     yield from bev_names(config.depths)
     yield from head_names()
 
 
-def voxel_rcnn_names(config: VoxelRcnnConfig) -> Names:
+def voxel_rcnn_names(config: VoxelRCNNConfig) -> Names:
     """Name Voxel R-CNN's layers; 1 x 1 convolutions over points there are linear layers here."""
     yield from encoder_names()
     yield from bev_names(config.depths)
@@ -118,14 +118,14 @@ def pointpillars_config(classes: int) -> PointPillarsConfig | None:
     }.get(classes)
 
 
-def second_config(classes: int) -> SecondConfig | None:
+def second_config(classes: int) -> SECONDConfig | None:
     """Return the toolbox's configuration for so many classes."""
-    return {1: KITTI_CAR, 3: SecondConfig(), 5: SECOND_ONCE}.get(classes)
+    return {1: KITTI_CAR, 3: SECONDConfig(), 5: SECOND_ONCE}.get(classes)
 
 
-def voxel_rcnn_config(classes: int) -> VoxelRcnnConfig | None:
+def voxel_rcnn_config(classes: int) -> VoxelRCNNConfig | None:
     """Return the toolbox's configuration for cars, and ours for more classes."""
-    return {1: VoxelRcnnConfig(), 3: VOXEL_RCNN_KITTI, 5: VOXEL_RCNN_ONCE}.get(classes)
+    return {1: VoxelRCNNConfig(), 3: VOXEL_RCNN_KITTI, 5: VOXEL_RCNN_ONCE}.get(classes)
 
 
 @dataclass(frozen=True)

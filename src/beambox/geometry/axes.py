@@ -93,15 +93,15 @@ class Axes:
         return f"x: {self.x}, y: {self.y}, z: {self.z}"
 
 
-def level_shift(rows: Tensor, raise_by: float, slope: tuple[float, float]) -> Tensor:
+def level_shift(rows: Tensor, z_offset: float, slope: tuple[float, float]) -> Tensor:
     """Return ``(N,)`` metres that bring z of points or boxes to another height and level the ground under them.
 
     Args:
         rows: ``(N, 2 or more)`` x forward, y left, in metres.
-        raise_by: metres to add everywhere.
+        z_offset: metres to add everywhere.
         slope: metres that the ground rises a metre forward and a metre to the left; taken away.
     """
-    return raise_by - slope[0] * rows[:, 0] - slope[1] * rows[:, 1]
+    return z_offset - slope[0] * rows[:, 0] - slope[1] * rows[:, 1]
 
 
 def turn_boxes(boxes: Tensor, matrix: Tensor) -> Tensor:

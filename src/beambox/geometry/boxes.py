@@ -1,7 +1,7 @@
 """Boxes in the LiDAR frame, and angles.
 
 A box is ``[x, y, z, l, w, h, yaw]``: geometric centre, length along the heading, width across, height; metres and
-radians. Yaw 0 points along +x and grows counter-clockwise seen from above. Drawn in ``docs/conventions.md``::
+radians. Yaw 0 points along +x and grows counter-clockwise in BEV. Drawn in ``docs/conventions.md``::
 
             x forward
             ^        heading of a box with yaw > 0
@@ -47,7 +47,7 @@ def wrap_angle(angle: Tensor, offset: float = 0.5, period: float = 2 * math.pi) 
 
 
 def rotate_z(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Rotate about +z, counter-clockwise seen from above.
+    """Rotate about +z, counter-clockwise in BEV.
 
     Args:
         vectors: ``(..., 2 or more)``; the first two columns are x and y, the others are kept.
@@ -98,7 +98,7 @@ def corners_3d(boxes: Tensor) -> Tensor:
 
 
 def corners_bev(boxes: Tensor) -> Tensor:
-    """Return the four corners seen from above, counter-clockwise from front-left: ``(N, 7)`` -> ``(N, 4, 2)``."""
+    """Return the four corners in BEV, counter-clockwise from front-left: ``(N, 7)`` -> ``(N, 4, 2)``."""
     return corners_3d(boxes)[:, :4, :2]
 
 

@@ -101,11 +101,11 @@ class Calibration:
         Returns:
             ``(N, 7)`` float64 boxes in the LiDAR frame.
         """
-        centre = self.rect_to_lidar(location)
+        center = self.rect_to_lidar(location)
         height, width, length = size.double().unbind(dim=1)
-        centre[:, 2] += height / 2
+        center[:, 2] += height / 2
         yaw = wrap_angle(-(rotation_y.double() + math.pi / 2))
-        return torch.cat((centre, torch.stack((length, width, height, yaw), dim=1)), dim=1)
+        return torch.cat((center, torch.stack((length, width, height, yaw), dim=1)), dim=1)
 
     def to_camera(self, boxes: Tensor, image_size: tuple[int, int] | None = None) -> CameraBoxes:
         """Turn LiDAR boxes into label boxes; inverse of :meth:`from_camera`.

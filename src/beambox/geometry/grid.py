@@ -16,7 +16,7 @@ __all__ = ["VoxelGrid"]
 MOST_CELLS = 900_000_000
 """Cells of a grid; indices of the sparse operations and a map's features would not fit beyond."""
 MOST_CELLS_OF_MAP = 40_000_000
-"""Cells seen from above: a region of 300 m in cells of 5 cm."""
+"""Cells in BEV: a region of 300 m in cells of 5 cm."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class VoxelGrid:
 
         cells = [max(1.0, (high - low) / step) for low, high, step in zip(self.minimum, self.maximum, self.cell)]
         if cells[0] * cells[1] > MOST_CELLS_OF_MAP or math.prod(cells) > MOST_CELLS:
-            told = " x ".join(f"{count:.4g}" for count in cells)
+            details = " x ".join(f"{count:.4g}" for count in cells)
             raise BeamboxError(
-                f"a grid of {told} cells fits no memory (at most {MOST_CELLS_OF_MAP:.1g} in a map and {MOST_CELLS:.1g} "
-                "in all): take a smaller range or larger cells"
+                f"a grid of {details} cells fits no memory (at most {MOST_CELLS_OF_MAP:.1g} in a map and "
+                f"{MOST_CELLS:.1g} in all): take a smaller range or larger cells"
             )
 
     @property
@@ -82,16 +82,16 @@ class VoxelGrid:
         inside = ((xyz >= 0) & (xyz < size)).all(dim=1)  # NaN compares false, so it is outside
         return torch.where(inside[:, None], xyz, 0.0).long().flip(1), inside
 
-    def centre(self, index: Tensor) -> Tensor:
+    def center(self, index: Tensor) -> Tensor:
         """Return the geometric centres (x, y, z) of cells given as ``(..., 3)`` (z, y, x): ``(..., 3)`` float32."""
         cell = constant(self.cell, index.device)
         minimum = constant(self.minimum, index.device)
         return (index.flip(-1) + 0.5) * cell + minimum
 
-    def contains(self, centres: Tensor) -> Tensor:
+    def contains(self, centers: Tensor) -> Tensor:
         """Tell which ``(N, 3 or more)`` positions lie in the closed region."""
-        low, high = (constant(values, centres.device, centres.dtype) for values in (self.minimum, self.maximum))
-        return ((centres[:, :3] >= low) & (centres[:, :3] <= high)).all(dim=1)
+        low, high = (constant(values, centers.device, centers.dtype) for values in (self.minimum, self.maximum))
+        return ((centers[:, :3] >= low) & (centers[:, :3] <= high)).all(dim=1)
 
     def window(self, first: tuple[int, int], cells: tuple[int, int]) -> VoxelGrid:
         """Return the part of the grid that starts at cell ``first`` (x, y) and spans ``cells`` (x, y); z is kept."""

@@ -19,7 +19,7 @@ from torch import nn
 
 from beambox import __version__
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.detectors.catalogue import build
+from beambox.detectors.catalog import build
 from beambox.infer.peaks import machine_peaks
 from beambox.infer.predictor import Detector
 from beambox.io import read_yaml
@@ -37,7 +37,7 @@ class Report:
     """Times of every stage and run, and what they were measured on."""
 
     milliseconds: dict[str, list[float]]
-    """One list a stage, one entry a run."""
+    """One list per stage, one entry per run."""
     setting: dict[str, Any]
     """Versions, device, precision, threads, numbers of points and runs, load of the machine."""
     peak_memory: float | None
@@ -46,7 +46,7 @@ class Report:
     """What the machine reaches at best, as :func:`beambox.infer.peaks.machine_peaks` measures it."""
 
     def of(self, stages: Sequence[str]) -> list[float]:
-        """Return the sum of some stages, one entry a run."""
+        """Return the sum of some stages, one entry per run."""
         return [sum(times) for times in zip(*(self.milliseconds[stage] for stage in stages))]
 
     @property
@@ -163,8 +163,8 @@ def measure(
     """
     if not paths or runs < 1 or warmup < 0 or batch < 1:
         raise BeamboxError(
-            f"a measurement needs sweeps and at least 1 run and 1 sweep a pass, got {len(paths)} sweeps, {runs} runs, "
-            f"{warmup} to warm up, {batch} sweeps a pass"
+            f"a measurement needs sweeps and at least 1 run and 1 sweep per pass, got {len(paths)} sweeps, "
+            f"{runs} runs, {warmup} to warm up, {batch} sweeps per pass"
         )
     if detector.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(detector.device)
@@ -215,9 +215,9 @@ def one_pass(detector: Detector, paths: Sequence[Path]) -> tuple[dict[str, float
 
 
 @contextmanager
-def calling(model: nn.Module, tell: Callable[[], None]) -> Iterator[None]:
-    """Call ``tell`` whenever one of a model's parts is about to run."""
-    handles = [part.register_forward_pre_hook(lambda *_: tell()) for part in model.children()]
+def calling(model: nn.Module, log: Callable[[], None]) -> Iterator[None]:
+    """Call ``log`` whenever one of a model's parts is about to run."""
+    handles = [part.register_forward_pre_hook(lambda *_: log()) for part in model.children()]
     try:
         yield
     finally:

@@ -43,7 +43,7 @@ class Card:
     """Bytes of the file."""
     sha256: str
     """Checksum of the file."""
-    said: Mapping[str, Any]
+    entries: Mapping[str, Any]
     """The card as it was written: data, recipe, licence, scores; the properties below read it."""
 
     def __str__(self) -> str:
@@ -83,13 +83,13 @@ class Card:
     @property
     def protocol(self) -> str:
         """How the scores were computed: benchmark, metric, unit."""
-        scores = self.said.get("scores")
+        scores = self.entries.get("scores")
         return str(scores.get("protocol", "")) if isinstance(scores, Mapping) else ""
 
     @property
     def scores(self) -> tuple[CardScores, ...]:
         """What the weights score, one entry for each data set."""
-        scores = self.said.get("scores")
+        scores = self.entries.get("scores")
         if not isinstance(scores, Mapping):
             return ()
         sets = [(str(name), entry) for name, entry in scores.items() if isinstance(entry, Mapping)]
@@ -104,7 +104,7 @@ class Card:
         )
 
     def _text(self, key: str) -> str:
-        value = self.said.get(key, "")
+        value = self.entries.get(key, "")
         return (
             value if isinstance(value, str) else ", ".join(map(str, value)) if isinstance(value, list) else str(value)
         )
@@ -112,7 +112,7 @@ class Card:
     def line(self) -> str:
         """One line for a list."""
         head = f"{self.name}: {self.detector}, {', '.join(self.classes)}; {self.size / 1e6:.1f} MB"
-        words = [str(self.said[key]) for key in ("summary", "licence") if key in self.said]
+        words = [str(self.entries[key]) for key in ("summary", "licence") if key in self.entries]
         return "; ".join([head, *words])
 
     def to_json(self) -> dict[str, Any]:
@@ -124,7 +124,7 @@ class Card:
             "parameters": self.parameters,
             "bytes": self.size,
             "sha256": self.sha256,
-            "card": dict(self.said),
+            "card": dict(self.entries),
         }
 
 
@@ -143,7 +143,7 @@ def read_card(path: Path) -> Card:
         parameters=sum(value.numel() for value in stored.tensors.values()),
         size=len(content),
         sha256=hashlib.sha256(content).hexdigest(),
-        said=stored.card,
+        entries=stored.card,
     )
 
 
@@ -155,7 +155,7 @@ def card_text(card: Card) -> str:
         "parameters": f"{card.parameters:,}",
         "file": f"{card.size / 1e6:.2f} MB, sha256 {card.sha256}",
     }
-    return "\n".join([card.name, *_lines({**head, **card.said}, 2)])
+    return "\n".join([card.name, *_lines({**head, **card.entries}, 2)])
 
 
 def _lines(values: Mapping[str, Any], indent: int) -> list[str]:

@@ -14,8 +14,8 @@ from beambox.io import write_text
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.metrics.kitti_result import KittiResult
 from beambox.simulate import SimulatedSource
-from beambox.visualise.canvas import save_picture
-from beambox.visualise.picture import draw_sweep
+from beambox.visualize.canvas import save_picture
+from beambox.visualize.picture import draw_sweep
 
 __all__ = ["Demo", "run_demo", "short_table"]
 
@@ -27,7 +27,7 @@ class Demo:
     scores: KittiResult
     """Average precision of the sweeps."""
     pictures: tuple[Path, ...]
-    """One picture a sweep."""
+    """One picture per sweep."""
     objects: int
     """Number of objects in all sweeps."""
     detections: int
@@ -42,7 +42,7 @@ def run_demo(
     seed: int,
     sensor: str = "hdl64",
     model: str = "",
-    tell: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> Demo:
     """Simulate sweeps, detect in them, score and draw the detections.
 
@@ -55,7 +55,7 @@ def run_demo(
         seed: of the simulation.
         sensor: of the simulation.
         model: name of the weights, for the results.
-        tell: is given a line after each sweep.
+        log: is given a line after each sweep.
     """
     source = SimulatedSource(frames, seed=seed, sensor=sensor)
     scored, pictures, objects, found = [], [], 0, 0
@@ -72,7 +72,7 @@ def run_demo(
         scored.append(KittiFrame(frame.labels, detections, frame.calibration, frame.image_size or (1242, 375)))
         objects += len(frame.labels)
         found += len(sure)
-        tell(f"{frame.id}: {len(frame):,} points, {len(frame.labels)} objects, {len(sure)} found -> {pictures[-1]}")
+        log(f"{frame.id}: {len(frame):,} points, {len(frame.labels)} objects, {len(sure)} found -> {pictures[-1]}")
     write_split(out / "data", "val", source.ids)
     scores = evaluate(scored, detector.classes)
     write_text(out / "scores.txt", scores.table())
@@ -81,7 +81,7 @@ def run_demo(
 
 
 def short_table(scores: KittiResult) -> str:
-    """Write one line a class: average precision over every recall, of the objects up to moderate difficulty."""
+    """Write one line per class: average precision over every recall, of the objects up to moderate difficulty."""
     lines = [f"{'AP, %':<14}{'objects':>8}{'overlap':>9}{'3-D':>8}{'above':>8}"]
     for one in scores.classes:
         three, above = one.box3d[1].all_points, one.bev[1].all_points

@@ -12,18 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beambox.data.ground_plane import fit_ground_plane, height_and_slope
 from beambox.data.placements import up_axis
-from beambox.data.reading import read_frame
-from beambox.data.road import fit_road_plane, height_and_slope
+from beambox.data.read_points import read_frame
 from beambox.geometry.axes import Axes
-from beambox.infer.corrections import Corrections
-from beambox.infer.trained import Trained
+from beambox.infer.sensor_alignment import SensorAlignment
+from beambox.infer.sensor_profile import SensorProfile
 from beambox.structures import Frame
 
-__all__ = ["Diagnosis", "Finding", "examine"]
+__all__ = ["Diagnosis", "Finding", "diagnose"]
 
 STEEP = 0.03
-"""A ground that rises by more than this is told of, metres a metre; KITTI's rises by 0.008 on average."""
+"""A ground that rises by more than this is told of, metres per metre; KITTI's rises by 0.008 on average."""
 
 Level = Literal["good", "note", "bad"]
 
@@ -48,7 +48,7 @@ class Diagnosis:
 
     findings: tuple[Finding, ...]
     """In the order in which they were looked at."""
-    corrections: Corrections = field(default_factory=Corrections)
+    alignment: SensorAlignment = field(default_factory=SensorAlignment)
     """What the remedies do to the points."""
     intensity_scale: float | None = None
     """Remedy for the intensity."""
@@ -59,14 +59,14 @@ class Diagnosis:
         return tuple(word for finding in self.findings for word in finding.option)
 
 
-def examine(path: Path | str, trained: Trained, fields: str | Sequence[str] | None = None) -> Diagnosis:
+def diagnose(path: Path | str, sensor_profile: SensorProfile, fields: str | Sequence[str] | None = None) -> Diagnosis:
     """Compare a sweep with the training data.
 
     Axes are judged first; height and range on the points with their axes put right.
 
     Args:
         path: the sweep.
-        trained: what the weights know.
+        sensor_profile: what the weights know.
         fields: names of the columns of a file that does not name them.
 
     Raises:
@@ -81,16 +81,16 @@ def examine(path: Path | str, trained: Trained, fields: str | Sequence[str] | No
     if units.level == "bad":  # what follows would measure metres that are none
         return Diagnosis(tuple(findings))
     axes_finding, axes = _axes(frame.points)
-    turned = Corrections(axes).apply(frame).points
-    plane = fit_road_plane(turned)
-    height_finding, raised = _height(plane, trained)
+    turned = SensorAlignment(axes).apply(frame).points
+    plane = fit_ground_plane(turned)
+    height_finding, raised = _height(plane, sensor_profile)
     fixed = turned.clone()
     fixed[:, 2] += raised
-    bright_finding, scale = _intensity(frame, path, trained, fields)
+    bright_finding, scale = _intensity(frame, path, sensor_profile, fields)
     findings += [axes_finding, height_finding, _slope(plane)]
-    findings += [_range(turned, fixed, trained), _density(fixed, trained), bright_finding]
+    findings += [_range(turned, fixed, sensor_profile), _density(fixed, sensor_profile), bright_finding]
     kept = tuple(finding for finding in findings if finding is not None)
-    return Diagnosis(kept, Corrections(axes, raised), scale)
+    return Diagnosis(kept, SensorAlignment(axes, raised), scale)
 
 
 def _units(points: Tensor) -> Finding:
@@ -160,18 +160,18 @@ def _sector(points: Tensor) -> tuple[float, float] | None:
     return float((start + width / 2 + 180) % 360 - 180), float(width)
 
 
-def _height(plane: Tensor | None, trained: Trained) -> tuple[Finding, float]:
+def _height(plane: Tensor | None, sensor_profile: SensorProfile) -> tuple[Finding, float]:
     if plane is None:
         return Finding("height", "note", "too few points near the sensor to find the ground"), 0.0
     ground, slope = height_and_slope(plane)
     height, tilt = -ground, math.degrees(math.atan(math.hypot(*slope)))
-    text = f"the ground lies {height:.2f} m below z = 0, in training {trained.sensor_height:.2f} m"
+    text = f"the ground lies {height:.2f} m below z = 0, in training {sensor_profile.sensor_height:.2f} m"
     if tilt > 6:
         return Finding("height", "note", f"{text}, but it is tilted by {tilt:.0f} degrees: level the points first"), 0.0
-    if abs(height - trained.sensor_height) <= 0.3:
+    if abs(height - sensor_profile.sensor_height) <= 0.3:
         return Finding("height", "good", text), 0.0
     option = ("--sensor-height", f"{round(height, 2) + 0.0:g}")
-    return Finding("height", "bad", text, option), round(height, 2) - trained.sensor_height
+    return Finding("height", "bad", text, option), round(height, 2) - sensor_profile.sensor_height
 
 
 def _slope(plane: Tensor | None) -> Finding | None:
@@ -189,10 +189,10 @@ def _slope(plane: Tensor | None) -> Finding | None:
     )
 
 
-def _range(given: Tensor, fixed: Tensor, trained: Trained) -> Finding:
-    low, high = trained.grid.minimum, trained.grid.maximum
-    inside = float(trained.grid.index(given)[1].float().mean())
-    then = float(trained.grid.index(fixed)[1].float().mean())
+def _range(given: Tensor, fixed: Tensor, sensor_profile: SensorProfile) -> Finding:
+    low, high = sensor_profile.grid.minimum, sensor_profile.grid.maximum
+    inside = float(sensor_profile.grid.index(given)[1].float().mean())
+    then = float(sensor_profile.grid.index(fixed)[1].float().mean())
     text = (
         f"{inside:.0%} of the points lie where the network looks (x {low[0]:g} to {high[0]:g}, "
         f"y {low[1]:g} to {high[1]:g}, z {low[2]:g} to {high[2]:g} m)"
@@ -209,10 +209,10 @@ def _range(given: Tensor, fixed: Tensor, trained: Trained) -> Finding:
     return Finding("range", "good", text)
 
 
-def _density(points: Tensor, trained: Trained) -> Finding:
-    inside = int(trained.grid.index(points)[1].sum())
-    text = f"{inside:,} points where the network looks, in training about {trained.points:,}"
-    if inside < trained.points / 5:
+def _density(points: Tensor, sensor_profile: SensorProfile) -> Finding:
+    inside = int(sensor_profile.grid.index(points)[1].sum())
+    text = f"{inside:,} points where the network looks, in training about {sensor_profile.points:,}"
+    if inside < sensor_profile.points / 5:
         return Finding(
             "density", "note", f"{text}: a sparser sensor is seen less far; near objects should still be found"
         )
@@ -220,26 +220,26 @@ def _density(points: Tensor, trained: Trained) -> Finding:
 
 
 def _intensity(
-    frame: Frame, path: Path | str, trained: Trained, fields: str | Sequence[str] | None
+    frame: Frame, path: Path | str, sensor_profile: SensorProfile, fields: str | Sequence[str] | None
 ) -> tuple[Finding, float | None]:
     """Compare the mean intensity; look for the factor that explains a difference."""
     mean = float(frame.points[:, 3].double().mean())
-    told = f"mean {mean:.3f} {spark(frame.points[:, 3])}, in training {trained.intensity_mean:.2f}"
+    details = f"mean {mean:.3f} {spark(frame.points[:, 3])}, in training {sensor_profile.intensity_mean:.2f}"
     if not bool(frame.points[:, 3].any()):
         return Finding(
             "intensity", "note", "there is none (all 0): the network was trained with it and will be less sure"
         ), None
-    ratio = mean / trained.intensity_mean
+    ratio = mean / sensor_profile.intensity_mean
     if 1 / 3 <= ratio <= 3:
-        return Finding("intensity", "good", told), None
+        return Finding("intensity", "good", details), None
     tiny = 1e-9  # reading with such a factor keeps large values from being clipped to 1
     raw = read_frame(path, fields=fields, intensity_scale=tiny).points[:, 3].double() / tiny
     usual = [1.0, 1 / 100, 1 / 255, 1 / 4095, 1 / 65535]
-    scale = min(usual, key=lambda s: abs(math.log(max(float(raw.mean()) * s, 1e-12) / trained.intensity_mean)))
-    if not 1 / 3 <= float(raw.mean()) * scale / trained.intensity_mean <= 3:
-        scale = trained.intensity_mean / float(raw.mean())  # no usual unit explains it: match the mean
+    scale = min(usual, key=lambda s: abs(math.log(max(float(raw.mean()) * s, 1e-12) / sensor_profile.intensity_mean)))
+    if not 1 / 3 <= float(raw.mean()) * scale / sensor_profile.intensity_mean <= 3:
+        scale = sensor_profile.intensity_mean / float(raw.mean())  # no usual unit explains it: match the mean
     scale = float(f"{scale:.2g}")
-    return Finding("intensity", "bad", told, ("--intensity-scale", f"{scale:g}")), scale
+    return Finding("intensity", "bad", details, ("--intensity-scale", f"{scale:g}")), scale
 
 
 def spark(values: Tensor) -> str:

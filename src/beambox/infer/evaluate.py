@@ -156,7 +156,7 @@ class Evaluation:
     """What the network computed in, such as ``float32``."""
 
     def to_json(self) -> dict[str, dict[str, Any]]:
-        """Return numbers ready for ``json.dump``: an entry a class, ``NAME@IOU`` for its second overlap and on."""
+        """Return numbers ready for ``json.dump``: an entry per class, ``NAME@IOU`` for its second overlap and on."""
         entries = merge_entries(self.rounds)
         for entry in entries.values():
             entry["precision"] = self.precision

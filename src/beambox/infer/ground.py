@@ -36,7 +36,7 @@ class EmptyGround:
         if self._met != state:
             self._met = state
         elif self._learnt != state:
-            columns = getattr(model, "config").columns  # noqa: B009
+            columns = getattr(model, "config").num_point_features  # noqa: B009
             with learning_ground():
                 model(Batch.of([Frame(torch.zeros(0, columns))]), grid)
             self._learnt = state

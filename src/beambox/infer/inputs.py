@@ -9,8 +9,8 @@ from pathlib import Path
 
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.formats.recording import ENDINGS, recording_of, sweeps_in
-from beambox.data.kitti import DEFAULT_IMAGE_SIZE, image_boxes_told, png_size, read_calibration, read_labels
-from beambox.data.reading import SUFFIXES, read_frame
+from beambox.data.kitti import DEFAULT_IMAGE_SIZE, image_boxes_given, png_size, read_calibration, read_labels
+from beambox.data.read_points import read_frame, readable_suffixes
 from beambox.io import read_text
 from beambox.structures import Frame
 
@@ -43,15 +43,15 @@ def find_sweeps(inputs: Sequence[str | Path]) -> list[Sweep]:
 
 
 def _expand(given: str) -> list[Path]:
-    path = Path(given)
+    path, suffixes = Path(given), readable_suffixes()
     if recording_of(path) is not None:
         return sweeps_in(path)
     if path.is_dir():
         for folder in (path, path / "velodyne", path / "training" / "velodyne", path / "testing" / "velodyne"):
-            found = sorted(p for p in folder.glob("*") if p.suffix.lower() in (*SUFFIXES, *ENDINGS))
+            found = sorted(p for p in folder.glob("*") if p.suffix.lower() in (*suffixes, *ENDINGS))
             if found:
                 return _each(found)
-        raise MissingFileError(f"{given} holds no sweep; looked for {' '.join('*' + e for e in SUFFIXES)}")
+        raise MissingFileError(f"{given} holds no sweep; looked for {' '.join('*' + e for e in suffixes)}")
     if path.exists():
         return [path]
     if glob.has_magic(given):
@@ -59,7 +59,7 @@ def _expand(given: str) -> list[Path]:
         if found:
             return _each(found)
         raise MissingFileError(f"no file fits the pattern {given}")
-    beside = sorted(p.name for p in path.parent.glob("*") if p.suffix.lower() in SUFFIXES)[:3]
+    beside = sorted(p.name for p in path.parent.glob("*") if p.suffix.lower() in suffixes)[:3]
     hint = f"; {path.parent}/ holds {', '.join(beside)} ..." if beside else ""
     raise MissingFileError(f"{given} is not there{hint}")
 
@@ -97,7 +97,7 @@ def read_sweep(
 
     Args:
         sweep: the file.
-        fields: names of the columns, see :func:`beambox.data.reading.read_frame`.
+        fields: names of the columns, see :func:`beambox.data.read_points.read_frame`.
         intensity_scale: factor that brings the intensity to [0, 1]; found from the numbers where None.
         labels: read the labels too.
     """
@@ -109,7 +109,7 @@ def read_sweep(
     calibration = read_calibration(calib)
     folder, stem = sweep.path.parent.parent, sweep.path.stem
     image, label = folder / "image_2" / f"{stem}.png", folder / "label_2" / f"{stem}.txt"
-    camera = image.exists() or not label.exists() or image_boxes_told(read_text(label)) is not False
+    camera = image.exists() or not label.exists() or image_boxes_given(read_text(label)) is not False
     if not camera:  # labels made without a camera: no image to crop to
         notes = "all image boxes are 0 (labels made without a camera): points are not cropped to a camera's view"
         frame = replace(frame, notes=(*frame.notes, notes))

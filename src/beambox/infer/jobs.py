@@ -30,8 +30,8 @@ class Job:
     """Of :func:`beambox.infer.predictor.load`."""
     out: Path
     kinds: Sequence[str] = ("jsonl",)
-    """jsonl or parquet, or formats of one file a sweep."""
-    min_score: float = 0.0
+    """jsonl or parquet, or formats of one file per sweep."""
+    score_threshold: float = 0.0
     shard: tuple[int, int] = (0, 1)
     """Which part of how many, counted from 0."""
 
@@ -61,7 +61,7 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 def choose_kinds(words: str) -> list[str]:
-    """Read ``"kitti,json"`` or ``"jsonl"``: formats of one file a sweep, or of many sweeps in one.
+    """Read ``"kitti,json"`` or ``"jsonl"``: formats of one file per sweep, or of many sweeps in one.
 
     Raises:
         BeamboxError: for an unknown format, none, or both sorts together.
@@ -154,8 +154,8 @@ def _spread(sweeps: Sequence[Sweep], job: Job, workers: int) -> Tally:
         whole.faults += one.faults[:MOST_FAULTS]
     ended = [process.exitcode for process in processes if process.exitcode]
     if faults or ended:
-        told = faults[0] if faults else f"exit status {ended[0]}"
-        raise BeamboxError(f"a worker failed ({told}); go on with the same command and --skip-existing")
+        details = faults[0] if faults else f"exit status {ended[0]}"
+        raise BeamboxError(f"a worker failed ({details}); go on with the same command and --skip-existing")
     return whole
 
 
@@ -202,7 +202,7 @@ def _each(sweeps: list[Sweep], job: Job, detector: Any, tally: Tally, journal: J
             tally.faults += [str(error)] if len(tally.faults) < MOST_FAULTS else []
             continue
         found = detector.detect([frame])[0]
-        found = found[found.scores >= job.min_score]
+        found = found[found.scores >= job.score_threshold]
         if journal is None:
             write_results(job.out, frame, found, job.kinds, job.model, sweep.name)
         else:

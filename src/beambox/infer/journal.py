@@ -91,20 +91,20 @@ def done_in(folder: Path) -> set[str]:
 
 def rows_in(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the rows of boxes of a journal, those of whole sweeps alone."""
-    held: list[dict[str, Any]] = []
+    pending: list[dict[str, Any]] = []
     with path.open("rb") as stream:
         for line in stream:
             if not line.endswith(b"\n"):
                 return
             if line.startswith(DONE.encode()):
-                yield from held
-                held = []
+                yield from pending
+                pending = []
             else:
-                held.append(parse_json(line.decode(), str(path)))
+                pending.append(parse_json(line.decode(), str(path)))
 
 
 def write_parquet(journals: Sequence[Path], out: Path) -> int:
-    """Write the boxes of journals as one Parquet file, one row a box; returns how many.
+    """Write the boxes of journals as one Parquet file, one row per box; returns how many.
 
     Raises:
         BeamboxError: if pyarrow is not installed.
@@ -116,14 +116,14 @@ def write_parquet(journals: Sequence[Path], out: Path) -> int:
     count = 0
     with replacing(out) as stream, parquet.ParquetWriter(stream, schema) as writer:
         for path in journals:
-            held: list[dict[str, Any]] = []
+            pending: list[dict[str, Any]] = []
             for row in rows_in(path):
-                held.append(row)
-                if len(held) == 100_000:
-                    writer.write_table(arrow.Table.from_pylist(held, schema=schema))
-                    count, held = count + len(held), []
-            writer.write_table(arrow.Table.from_pylist(held, schema=schema))
-            count += len(held)
+                pending.append(row)
+                if len(pending) == 100_000:
+                    writer.write_table(arrow.Table.from_pylist(pending, schema=schema))
+                    count, pending = count + len(pending), []
+            writer.write_table(arrow.Table.from_pylist(pending, schema=schema))
+            count += len(pending)
     return count
 
 

@@ -77,14 +77,14 @@ class KeptDetections:
             raise BeamboxError(f"{self.path}, line {number}: expected a JSON object; these are no kept detections")
         return content
 
-    def _check(self, held: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-        if held.get("format") != FORMAT:
+    def _check(self, stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+        if stored.get("format") != FORMAT:
             raise BeamboxError(f"{self.path} is not a file of kept detections (no {FORMAT}); give another name")
-        differing = [key for key, value in wanted.items() if held.get(key) != value]
+        differing = [key for key, value in wanted.items() if stored.get(key) != value]
         if differing:
             key = differing[0]
             raise BeamboxError(
-                f"{self.path} holds detections made otherwise: {key} was {held.get(key)}, is {wanted[key]}; "
+                f"{self.path} holds detections made otherwise: {key} was {stored.get(key)}, is {wanted[key]}; "
                 "give another name, or remove it"
             )
 

@@ -13,25 +13,25 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from beambox.checks import BeamboxError, MissingFileError, did_you_mean
+from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.formats.kept import close_kept
-from beambox.data.reading import points_from_array
+from beambox.data.read_points import points_from_array
 from beambox.detectors.weights import load_weights, read_weights
 from beambox.geometry import VoxelGrid
 from beambox.geometry.axes import Axes
-from beambox.infer.corrections import Corrections
+from beambox.infer.bn_folding import fold_batch_norms
 from beambox.infer.forking import survive_fork
-from beambox.infer.fusion import fold_batch_norms
 from beambox.infer.ground import EmptyGround
 from beambox.infer.inputs import Sweep, read_sweep
 from beambox.infer.memory import keep_memory
 from beambox.infer.precision import choose_device, choose_precision
+from beambox.infer.sensor_alignment import SensorAlignment
+from beambox.infer.sensor_profile import SensorProfile
 from beambox.infer.streaming import Input, each_input, groups, names_one_sweep
-from beambox.infer.trained import Trained
 from beambox.structures import Batch, Detections, Frame, expect_columns
-from beambox.zoo import shipped
+from beambox.zoo import find_weights
 
-__all__ = ["Detector", "Input", "View", "find_weights", "load", "region"]
+__all__ = ["Detector", "Input", "View", "load", "region"]
 
 log = logging.getLogger("beambox")
 
@@ -43,7 +43,7 @@ STRIDE = 8
 
 
 class Detector:
-    """A network for inference with everything around it: reading, corrections, precision, boxes in the given frame."""
+    """A network for inference with what it needs: reading, alignment, precision, boxes in the given frame."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Detector:
         precision: str = "auto",
         grid: VoxelGrid | None = None,
         view: View = "auto",
-        corrections: Corrections | None = None,
+        alignment: SensorAlignment | None = None,
         intensity_scale: float | None = None,
         fields: str | Sequence[str] | None = None,
         batch_size: int = 1,
@@ -69,7 +69,7 @@ class Detector:
             grid: region to look at, with cells of the model's size; the model's own where None.
             view: "camera" keeps the points that the camera sees (KITTI's labels exist only there), "full" keeps all;
                 "auto" is "camera" for a sweep with a calibration where the network looks ahead only.
-            corrections: of another sensor's points.
+            alignment: of another sensor's points.
             intensity_scale: factor that brings the intensity to [0, 1]; found from the numbers where None.
             fields: names of the columns of files that do not name them.
             batch_size: sweeps that go through the network together when a list is given.
@@ -82,7 +82,7 @@ class Detector:
         self.config: Any = model.config
         self.grid: VoxelGrid = grid or self.config.grid
         self.view: View = view
-        self.corrections = corrections or Corrections()
+        self.alignment = alignment or SensorAlignment()
         self.intensity_scale = intensity_scale
         self.fields = fields
         self.batch_size = batch_size
@@ -163,7 +163,7 @@ class Detector:
 
     def prepare(self, frame: Frame) -> Frame:
         """Crop to the view and correct."""
-        return self.corrections.apply(self.crop(frame))
+        return self.alignment.apply(self.crop(frame))
 
     def sees(self, prepared: Frame) -> bool:
         """Tell whether any point lies where the network looks; warns where points are there, but none does."""
@@ -192,7 +192,7 @@ class Detector:
         """Detect in frames that pass through the network together; where there is no point, there is nothing."""
         survive_fork()
         for frame in frames:
-            expect_columns(frame, self.config.columns)
+            expect_columns(frame, self.config.num_point_features)
         prepared = [self.prepare(frame) for frame in frames]
         seen = [k for k, frame in enumerate(prepared) if self.sees(frame)]
         found = [Detections.empty(self.classes, frame.id) for frame in frames]
@@ -216,7 +216,7 @@ class Detector:
         """Decode, and carry the boxes into the frame of the points as given."""
         decoded = self.model.decode(predictions)
         return [
-            self.corrections.carry_back(replace(found.to("cpu"), frame_id=frame.id))
+            self.alignment.to_sensor(replace(found.to("cpu"), frame_id=frame.id))
             for found, frame in zip(decoded, frames)
         ]
 
@@ -260,37 +260,8 @@ def region(model_grid: VoxelGrid, wanted: float | Sequence[float] | VoxelGrid) -
 
 
 def covers(trained: VoxelGrid, wanted: VoxelGrid) -> bool:
-    """Whether one region lies within another, seen from above."""
+    """Whether one region lies within another, in BEV."""
     return all(trained.minimum[k] <= wanted.minimum[k] and wanted.maximum[k] <= trained.maximum[k] for k in (0, 1))
-
-
-def find_weights(name: str | Path) -> Path:
-    """Find a weight file: a shipped name, a path, or the folder of a training run.
-
-    Raises:
-        BeamboxError: naming the nearest shipped name.
-    """
-    path = Path(name)
-    if path.is_file():
-        if path.suffix.lower() in (".pth", ".pt", ".ckpt"):
-            raise BeamboxError(
-                f"{path} is a PyTorch checkpoint; beambox reads .safetensors. One of OpenPCDet's is converted by "
-                "`beambox import-openpcdet`; one of a training run lies beside its weights"
-            )
-        return path
-    if path.is_dir():
-        for file in ("best.safetensors", "final.safetensors"):
-            if (path / file).is_file():
-                return path / file
-        found = sorted(path.glob("*.safetensors"))
-        if len(found) == 1:
-            return found[0]
-        raise MissingFileError(f"{path} is a folder with {len(found)} weight files; name one (*.safetensors)")
-    names = shipped()
-    if str(name) in names:
-        return names[str(name)]
-    hint = did_you_mean(str(name), names) if names else "; none is shipped with this installation"
-    raise MissingFileError(f'no weights are called "{name}" and no such file is there{hint}')
 
 
 def load(
@@ -321,7 +292,7 @@ def load(
         axes: where x and y lead, such as ``"x: right, y: forward"``, where that is not forward and left.
         ground_slope: metres that the ground rises a metre forward and a metre to the left, where it does not lie level.
         intensity_scale: factor that brings the intensity to [0, 1], such as 0.01 for percent; None finds it from the
-            numbers, as :mod:`beambox.data.reading` says.
+            numbers, as :mod:`beambox.data.read_points` says.
         fields: names of the columns of files that do not name them, such as "x,y,z,intensity,ring".
         batch_size: sweeps that go through the network together when a list is given.
 
@@ -333,10 +304,10 @@ def load(
     chosen = choose_device(device)
     model: Any = load_weights(path, "cpu")
     card = read_weights(path).card
-    trained = Trained.of(card, model.config.grid).sensor_height
-    corrections = Corrections(
+    trained = SensorProfile.of(card, model.config.grid).sensor_height
+    alignment = SensorAlignment(
         axes=Axes.parse(axes) if isinstance(axes, str) else axes or Axes(),
-        raise_by=0.0 if sensor_height is None else sensor_height - trained,
+        z_offset=0.0 if sensor_height is None else sensor_height - trained,
         slope=ground_slope,
     )
     grid: VoxelGrid = model.config.grid if range is None else region(model.config.grid, range)
@@ -353,7 +324,7 @@ def load(
         precision=precision,
         grid=grid,
         view=view,
-        corrections=corrections,
+        alignment=alignment,
         intensity_scale=intensity_scale,
         fields=fields,
         batch_size=batch_size,

@@ -1,4 +1,4 @@
-"""Detections on disk: KITTI text, JSON and CSV, one file a sweep; and back."""
+"""Detections on disk: KITTI text, JSON and CSV, one file per sweep; and back."""
 
 from __future__ import annotations
 

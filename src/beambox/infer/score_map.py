@@ -1,4 +1,4 @@
-"""The class scores of a network as a map seen from above, beside its detections."""
+"""The class scores of a network as a map in BEV, beside its detections."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from beambox.detectors.kassd import KassdPredictions
-from beambox.detectors.voxel_rcnn import VoxelRcnnPredictions
+from beambox.detectors.kassd import KASSDPredictions
+from beambox.detectors.voxel_rcnn import VoxelRCNNPredictions
 from beambox.infer.predictor import Detector
 from beambox.structures import Batch, Detections, Frame
 
@@ -41,9 +41,9 @@ def score_map(detector: Detector, predictions: Any) -> Tensor:
         predictions: of its network; of two stages, those of the first are shown.
     """
     head = predictions
-    if isinstance(predictions, KassdPredictions):
+    if isinstance(predictions, KASSDPredictions):
         head = predictions.head
-    elif isinstance(predictions, VoxelRcnnPredictions):
+    elif isinstance(predictions, VoxelRCNNPredictions):
         head = predictions.first
     rows, columns = detector.model.anchors.map_size(detector.grid)
     best = torch.sigmoid(head.cls.float()).amax(dim=2)  # (B, N), anchors in the order (y, x, class, rotation)

@@ -55,11 +55,11 @@ def each_input(given: Input | Sweep | Iterable[Input | Sweep]) -> Iterator[Input
 
 def groups(given: Iterable[Input | Sweep], read: Callable[[Input | Sweep], Frame], size: int) -> Iterator[list[Frame]]:
     """Read inputs as they come and yield lists of ``size`` frames, the last one perhaps shorter."""
-    held: list[Frame] = []
+    pending: list[Frame] = []
     for one in given:
-        held.append(read(one))
-        if len(held) == size:
-            yield held
-            held = []
-    if held:
-        yield held
+        pending.append(read(one))
+        if len(pending) == size:
+            yield pending
+            pending = []
+    if pending:
+        yield pending

@@ -23,11 +23,11 @@ class AnchorClass:
     """Class."""
     size: tuple[float, float, float]
     """Length, width, height in metres."""
-    bottom: float
+    bottom_z: float
     """Height of the anchors' lower face in the LiDAR frame, metres."""
-    matched: float
+    matched_threshold: float
     """Overlap with an object from which an anchor is positive."""
-    unmatched: float
+    unmatched_threshold: float
     """Overlap below which an anchor is negative."""
 
 
@@ -62,7 +62,7 @@ class AnchorGrid:
     classes: tuple[AnchorClass, ...]
     region: VoxelGrid
     stride: int
-    centred: bool = False
+    centered: bool = False
 
     def map_size(self, grid: VoxelGrid) -> tuple[int, int]:
         """Return the map's size (y, x) over ``grid``."""
@@ -73,7 +73,7 @@ class AnchorGrid:
         low, high, step = self.region.minimum[axis], self.region.maximum[axis], self.region.cell[axis] * self.stride
         first = round((grid.minimum[axis] - low) / step)
         index = torch.arange(first, first + count, dtype=torch.float64)
-        if self.centred:
+        if self.centered:
             return low + (index + 0.5) * step
         of_region = -(-self.region.size[axis] // self.stride)
         return low + index * (high - low) / max(1, of_region - 1)
@@ -81,7 +81,7 @@ class AnchorGrid:
     def boxes(self, grid: VoxelGrid, device: torch.device | str = "cpu") -> Tensor:
         """Return all anchors over ``grid``, in the order (y, x, class, rotation).
 
-        They are made once a grid and device, and kept: nobody may write to them.
+        They are made once per grid and device, and kept: nobody may write to them.
 
         Returns:
             ``(ny * nx * classes * 2, 7)`` float32.
@@ -100,7 +100,7 @@ class AnchorGrid:
         ny, nx = self.map_size(grid)
         xs, ys = self._positions(0, grid, nx), self._positions(1, grid, ny)
         shapes = torch.tensor(
-            [(c.bottom + c.size[2] / 2, *c.size, rotation) for c in self.classes for rotation in ROTATIONS],
+            [(c.bottom_z + c.size[2] / 2, *c.size, rotation) for c in self.classes for rotation in ROTATIONS],
             dtype=torch.float64,
         )  # (A, 5) z, l, w, h, yaw
         out = torch.empty(ny, nx, len(shapes), 7, dtype=torch.float64)

@@ -15,7 +15,7 @@ from beambox.ops.map_conv import GroundedConv, MapKernel
 
 __all__ = [
     "BevBackbone",
-    "MapBlock",
+    "ConvBnReLU",
     "conv_bn_relu",
     "deconv_bn_relu",
     "enlarge_and_join",
@@ -27,7 +27,7 @@ BN_EPS = 1e-3
 BN_MOMENTUM = 0.01
 
 
-class MapBlock(nn.Sequential):
+class ConvBnReLU(nn.Sequential):
     """A convolution of maps, batch norm, ReLU; once folded, one operation."""
 
     _folded: GroundedConv | None = None
@@ -67,10 +67,10 @@ class MapBlock(nn.Sequential):
         return GroundedConv(MapKernel(conv.weight, conv.bias, *options, relu=True))
 
 
-def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> MapBlock:
+def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> ConvBnReLU:
     """Convolution that keeps the size (divided by ``stride``), batch norm (eps 1e-3, momentum 0.01), ReLU."""
     padding = dilation * (kernel // 2)
-    return MapBlock(
+    return ConvBnReLU(
         nn.Conv2d(in_channels, channels, kernel, stride, padding, dilation, bias=False),
         nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
         nn.ReLU(inplace=True),
@@ -79,9 +79,9 @@ def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int =
 
 def deconv_bn_relu(
     in_channels: int, channels: int, kernel: int, stride: int, padding: int = 0, output_padding: int = 0
-) -> MapBlock:
+) -> ConvBnReLU:
     """Transposed convolution that enlarges by ``stride``, batch norm, ReLU."""
-    return MapBlock(
+    return ConvBnReLU(
         nn.ConvTranspose2d(in_channels, channels, kernel, stride, padding, output_padding, bias=False),
         nn.BatchNorm2d(channels, eps=BN_EPS, momentum=BN_MOMENTUM),
         nn.ReLU(inplace=True),
@@ -154,7 +154,7 @@ def enlarge_and_join(ups: Iterable[nn.Module], levels: Sequence[Tensor]) -> Tens
 
     Folded blocks write to their place in the joined map, which saves a copy of it.
     """
-    folded = [up.folded for up in ups if isinstance(up, MapBlock) and up.folded is not None]
+    folded = [up.folded for up in ups if isinstance(up, ConvBnReLU) and up.folded is not None]
     if len(folded) < len(levels) or not all(up.is_fused(level) for up, level in zip(folded, levels)):
         return join_levels([up(level) for up, level in zip(ups, levels)])
     height, width = folded[0].kernel.size(levels[0].shape[2:])

@@ -33,21 +33,21 @@ def encode_boxes(boxes: Tensor, anchors: Tensor) -> Tensor:
     diagonal = torch.linalg.vector_norm(anchors[..., 3:5], dim=-1, keepdim=True)
     height = anchors[..., 5:6]
     reach = torch.cat((diagonal, diagonal, height), dim=-1)  # (..., 3)
-    centre = (boxes[..., :3] - anchors[..., :3]) / reach
+    center = (boxes[..., :3] - anchors[..., :3]) / reach
     size = torch.log(boxes[..., 3:6].clamp(min=1e-5) / anchors[..., 3:6].clamp(min=1e-5))
-    return torch.cat((centre, size, boxes[..., 6:7] - anchors[..., 6:7]), dim=-1)
+    return torch.cat((center, size, boxes[..., 6:7] - anchors[..., 6:7]), dim=-1)
 
 
-def decode_boxes(codes: Tensor, anchors: Tensor) -> Tensor:
+def decode_boxes(deltas: Tensor, anchors: Tensor) -> Tensor:
     """Inverse of :func:`encode_boxes`; headings are known up to half a turn until :func:`resolve_heading`.
 
     Sizes stay finite whatever the codes: they grow to at most a thousand times the anchor's.
     """
     diagonal = torch.linalg.vector_norm(anchors[..., 3:5], dim=-1, keepdim=True)
     reach = torch.cat((diagonal, diagonal, anchors[..., 5:6]), dim=-1)
-    centre = codes[..., :3] * reach + anchors[..., :3]
-    size = torch.exp(codes[..., 3:6].clamp(max=LARGEST_GROWTH)) * anchors[..., 3:6]
-    return torch.cat((centre, size, codes[..., 6:7] + anchors[..., 6:7]), dim=-1)
+    center = deltas[..., :3] * reach + anchors[..., :3]
+    size = torch.exp(deltas[..., 3:6].clamp(max=LARGEST_GROWTH)) * anchors[..., 3:6]
+    return torch.cat((center, size, deltas[..., 6:7] + anchors[..., 6:7]), dim=-1)
 
 
 def direction_bin(yaw: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ def mean_voxels(voxels: Voxels, absolute_xy: bool = True) -> SparseTensor:
     means = segment_mean(voxels.points, voxels.voxel, len(voxels.index))  # (V, C)
     if not absolute_xy:
         cell = constant(voxels.grid.cell[:2], means.device)
-        offset = (means[:, :2] - voxels.grid.centre(voxels.index[:, 1:])[:, :2]) / cell
+        offset = (means[:, :2] - voxels.grid.center(voxels.index[:, 1:])[:, :2]) / cell
         means = torch.cat((offset.to(means.dtype), means[:, 2:]), dim=1)
     nz, ny, nx = voxels.grid.shape
     sites = Sites.trusted(voxels.index, (nz + 1, ny, nx), voxels.batch_size)
@@ -93,7 +93,7 @@ class VoxelEncoder(nn.Module):
     def forward(self, voxels: SparseTensor) -> EncoderStages:
         """Encode ``(V, in_channels)`` voxel features."""
         strided = (self.stage2[0], self.stage3[0], self.stage4[0], self.out)
-        find_chain(voxels.sites, [block.conv.geometry for block in strided])  # pyright: ignore
+        find_chain(voxels.sites, [block.conv.spec for block in strided])  # pyright: ignore
         with torch.autocast(voxels.features.device.type, enabled=False):  # metres: bfloat16 would round them to 0.5
             stem = self.stem(voxels)
         stride1 = self.stage1(stem)

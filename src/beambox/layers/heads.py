@@ -40,7 +40,7 @@ class AnchorPredictions:
     cls: Tensor
     """``(B, N, K)`` class logits."""
     box: Tensor
-    """``(B, N, 7)`` box codes relative to the anchors."""
+    """``(B, N, 7)`` box deltas relative to the anchors."""
     direction: Tensor
     """``(B, N, 2)`` logits of the two half turns."""
     anchors: Tensor
@@ -180,7 +180,9 @@ def anchor_loss(
     Returns:
         Scalars ``cls``, ``loc``, ``direction``.
     """
-    targets = [assign(anchors, predictions.grid, predictions.anchors, gt, kinds) for gt, kinds in zip(boxes, classes)]
+    targets = [
+        assign(anchors, predictions.grid, predictions.anchors, gt, class_ids) for gt, class_ids in zip(boxes, classes)
+    ]
     label = torch.stack([target.label for target in targets])  # (B, N)
     sample, anchor = torch.nonzero(label > 0, as_tuple=True)  # (P,) each
     count = (label > 0).sum(dim=1).clamp(min=1).float()  # (B,)
@@ -191,12 +193,12 @@ def anchor_loss(
     focal = sigmoid_focal(predictions.cls.float(), wanted).sum(dim=-1)  # (B, N)
     cls = ((focal * (label >= 0)).sum(dim=1) * share).sum()
 
-    objects = torch.cat([gt[t.matched[t.positive]] for gt, t in zip(boxes, targets)])  # (P, 7)
-    codes = encode_boxes(objects, predictions.anchors[anchor])
-    difference = sine_difference(predictions.box[sample, anchor].float(), codes)
+    gt_boxes = torch.cat([gt[t.gt_index[t.positive]] for gt, t in zip(boxes, targets)])  # (P, 7)
+    deltas = encode_boxes(gt_boxes, predictions.anchors[anchor])
+    difference = sine_difference(predictions.box[sample, anchor].float(), deltas)
     loc = (smooth_l1(difference, beta).sum(dim=1) * share[sample]).sum()
     logits = predictions.direction[sample, anchor].float()
-    turned = functional.cross_entropy(logits, direction_bin(objects[:, 6]), reduction="none")
+    turned = functional.cross_entropy(logits, direction_bin(gt_boxes[:, 6]), reduction="none")
     direction = (turned * share[sample]).sum()
     return {"cls": weights.cls * cls, "loc": weights.loc * loc, "direction": weights.direction * direction}
 
@@ -279,7 +281,7 @@ def suppressed(
     columns = torch.cat(
         (of_rows(boxes, rows), score.gather(1, rows)[..., None], label.gather(1, rows)[..., None]), dim=2
     )
-    told = torch.cat((columns.flatten(), number.to(columns.dtype))).cpu()  # whole numbers this small are exact
-    table = told[: columns.numel()].view(columns.shape)
-    numbers = [int(n) for n in told[columns.numel() :].tolist()]
+    packed = torch.cat((columns.flatten(), number.to(columns.dtype))).cpu()  # whole numbers this small are exact
+    table = packed[: columns.numel()].view(columns.shape)
+    numbers = [int(n) for n in packed[columns.numel() :].tolist()]
     return [(one[:n, :7], one[:n, 7], one[:n, 8].long()) for one, n in zip(table, numbers)]

@@ -34,7 +34,7 @@ def smooth_l1(difference: Tensor, beta: float = 1 / 9) -> Tensor:
 
 
 def sine_difference(predicted: Tensor, target: Tensor) -> Tensor:
-    """Difference of ``(..., 7)`` box codes with the angle's replaced by ``sin(predicted - target)``.
+    """Difference of ``(..., 7)`` box deltas with the angle's replaced by ``sin(predicted - target)``.
 
     A box turned by half a turn then costs nothing: telling front from rear is the direction classifier's work.
     """

@@ -24,12 +24,12 @@ class PillarFeatures(nn.Module):
     """
 
     def __init__(
-        self, channels: int = 64, columns: int = 4, absolute_xy: bool = True, empty_slots: int | None = None
+        self, channels: int = 64, num_point_features: int = 4, absolute_xy: bool = True, empty_slots: int | None = None
     ) -> None:
         super().__init__()
         self.absolute_xy = absolute_xy
         self.empty_slots = empty_slots
-        inputs = columns + 6 - (0 if absolute_xy else 2)
+        inputs = num_point_features + 6 - (0 if absolute_xy else 2)
         self.linear = nn.Linear(inputs, channels, bias=False)
         self.norm = nn.BatchNorm1d(channels, eps=1e-3, momentum=0.01)
 
@@ -37,9 +37,9 @@ class PillarFeatures(nn.Module):
         """Return one feature a cell, ``(V, channels)``, all at least 0."""
         xyz, size = voxels.points[:, :3], voxels.index.shape[0]
         mean = segment_mean(xyz, voxels.voxel, size)  # (V, 3)
-        centre = voxels.grid.centre(voxels.index[:, 1:]).to(xyz.dtype)  # (V, 3)
+        center = voxels.grid.center(voxels.index[:, 1:]).to(xyz.dtype)  # (V, 3)
         absolute = voxels.points if self.absolute_xy else voxels.points[:, 2:]
-        described = torch.cat((absolute, xyz - mean[voxels.voxel], xyz - centre[voxels.voxel]), dim=1)
+        described = torch.cat((absolute, xyz - mean[voxels.voxel], xyz - center[voxels.voxel]), dim=1)
         lifted = self.lift(described)  # (K, channels)
         if self.training and len(lifted) < 2:  # batch statistics need two values
             lifted = functional.batch_norm(

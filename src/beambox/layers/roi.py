@@ -19,7 +19,7 @@ from beambox.ops.nms import nms, nms_of_samples
 from beambox.ops.rotated_iou import iou_3d
 
 __all__ = [
-    "ProposalLimits",
+    "NmsConfig",
     "RoiSampling",
     "RoiTargets",
     "Rois",
@@ -36,7 +36,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class ProposalLimits:
+class NmsConfig:
     """How many of the first stage's boxes go on to the second."""
 
     pre: int
@@ -75,19 +75,19 @@ class Rois:
 class RoiSampling:
     """Which proposals the second stage is taught on, and what (PV-RCNN, section 3.4)."""
 
-    per_sample: int = 128
+    rois_per_frame: int = 128
     """Regions drawn from each sample."""
-    positive_share: float = 0.5
+    fg_fraction: float = 0.5
     """Share of positive ones at most."""
-    positive_iou: float = 0.55
+    fg_iou: float = 0.55
     """Overlap (3-D, with an object of the predicted class) from which a region is positive and regresses."""
-    easy_iou: float = 0.1
+    bg_iou_low: float = 0.1
     """Overlap below which a negative region is easy."""
-    hard_share: float = 0.8
+    hard_bg_fraction: float = 0.8
     """Share of hard ones among the negatives."""
-    score_low: float = 0.25
+    cls_bg_iou: float = 0.25
     """Overlap at which the taught score is 0."""
-    score_high: float = 0.75
+    cls_fg_iou: float = 0.75
     """Overlap at which the taught score is 1."""
 
 
@@ -107,7 +107,7 @@ class RoiTargets:
     """``(R,)`` bool: whether the box is to be learnt."""
 
 
-def propose(predictions: AnchorPredictions, limits: ProposalLimits) -> Rois:
+def propose(predictions: AnchorPredictions, limits: NmsConfig) -> Rois:
     """Take each sample's best decoded boxes through a class-agnostic suppression; no gradient."""
     with torch.no_grad():
         if waiting_is_dear(predictions.cls):
@@ -124,7 +124,7 @@ def propose(predictions: AnchorPredictions, limits: ProposalLimits) -> Rois:
         )
 
 
-def _propose_of_samples(predictions: AnchorPredictions, limits: ProposalLimits) -> Rois:
+def _propose_of_samples(predictions: AnchorPredictions, limits: NmsConfig) -> Rois:
     """Propose as many regions for each sample, without asking how many exist."""
     score, label = predictions.cls.float().max(dim=-1)  # (B, N)
     score, rows, count = best_of_samples(score, -math.inf, limits.pre)
@@ -166,16 +166,16 @@ def sample_rois(
                 continue
             iou, best = best_overlap(rois.boxes[rows], rois.labels[rows], boxes[sample], classes[sample])
             drawn = _draw(iou.cpu(), options, generator).to(rows.device)
-            objects = boxes[sample].to(rois.boxes)
+            gt_boxes = boxes[sample].to(rois.boxes)
             chosen.append(rows[drawn])
             overlaps.append(iou[drawn])
-            matched.append(objects[best[drawn]] if len(objects) else rois.boxes[rows[drawn]])
+            matched.append(gt_boxes[best[drawn]] if len(gt_boxes) else rois.boxes[rows[drawn]])
         if not chosen:
             nothing = rois.boxes.new_zeros(0)
             return RoiTargets(rois, rois.boxes, nothing, nothing, nothing.bool())
         row, iou = torch.cat(chosen), torch.cat(overlaps)
         picked = Rois(rois.boxes[row], rois.labels[row], rois.sample[row], rois.batch_size)
-        return RoiTargets(picked, torch.cat(matched), iou, overlap_score(iou, options), iou > options.positive_iou)
+        return RoiTargets(picked, torch.cat(matched), iou, overlap_score(iou, options), iou > options.fg_iou)
 
 
 def best_overlap(rois: Tensor, labels: Tensor, boxes: Tensor, classes: Tensor) -> tuple[Tensor, Tensor]:
@@ -200,34 +200,34 @@ def best_overlap(rois: Tensor, labels: Tensor, boxes: Tensor, classes: Tensor) -
 
 def _draw(iou: Tensor, options: RoiSampling, generator: torch.Generator | None) -> Tensor:
     """Draw rows: positives without repetition, negatives with, hard ones first."""
-    total = options.per_sample
-    positive = torch.nonzero(iou >= options.positive_iou)[:, 0]
-    hard = torch.nonzero((iou < options.positive_iou) & (iou >= options.easy_iou))[:, 0]
-    easy = torch.nonzero(iou < options.easy_iou)[:, 0]
+    total = options.rois_per_frame
+    positive = torch.nonzero(iou >= options.fg_iou)[:, 0]
+    hard = torch.nonzero((iou < options.fg_iou) & (iou >= options.bg_iou_low))[:, 0]
+    easy = torch.nonzero(iou < options.bg_iou_low)[:, 0]
 
     def repeated(rows: Tensor, count: int) -> Tensor:
         return rows[torch.randint(len(rows), (count,), generator=generator)]
 
     if len(hard) + len(easy) == 0:
         return repeated(positive, total)
-    wanted = min(round(total * options.positive_share), len(positive))
+    wanted = min(round(total * options.fg_fraction), len(positive))
     first = positive[torch.randperm(len(positive), generator=generator)[:wanted]]
     negatives = total - wanted
     if len(hard) == 0:
         return torch.cat((first, repeated(easy, negatives)))
     if len(easy) == 0:
         return torch.cat((first, repeated(hard, negatives)))
-    of_hard = min(int(options.hard_share * negatives), len(hard))
+    of_hard = min(int(options.hard_bg_fraction * negatives), len(hard))
     return torch.cat((first, repeated(hard, of_hard), repeated(easy, negatives - of_hard)))
 
 
 def overlap_score(iou: Tensor, options: RoiSampling) -> Tensor:
-    """Return the score to learn: 0 up to ``score_low``, 1 from ``score_high`` on, linear between."""
-    return ((iou - options.score_low) / (options.score_high - options.score_low)).clamp(0, 1)
+    """Return the score to learn: 0 up to ``cls_bg_iou``, 1 from ``cls_fg_iou`` on, linear between."""
+    return ((iou - options.cls_bg_iou) / (options.cls_fg_iou - options.cls_bg_iou)).clamp(0, 1)
 
 
 def canonical_targets(boxes: Tensor, rois: Tensor) -> Tensor:
-    """Express objects in the frames of their regions, as box codes to regress.
+    """Express objects in the frames of their regions, as box deltas to regress.
 
     The heading is taken relative to the region's and folded into [-pi / 2, pi / 2]: the second stage refines a
     heading and does not tell front from rear.
@@ -239,19 +239,19 @@ def canonical_targets(boxes: Tensor, rois: Tensor) -> Tensor:
     Returns:
         ``(R, 7)`` codes relative to a box at the origin with the region's sizes.
     """
-    centre = rotate_z(boxes[:, :3] - rois[:, :3], -rois[:, 6])
+    center = rotate_z(boxes[:, :3] - rois[:, :3], -rois[:, 6])
     turn = wrap_angle(boxes[:, 6] - rois[:, 6], 0.0)  # [0, 2 pi)
     opposite = (turn > math.pi / 2) & (turn < 1.5 * math.pi)
     turn = wrap_angle(torch.where(opposite, turn + math.pi, turn)).clamp(-math.pi / 2, math.pi / 2)
-    local = torch.cat((centre, boxes[:, 3:6], turn[:, None]), dim=1)
+    local = torch.cat((center, boxes[:, 3:6], turn[:, None]), dim=1)
     return encode_boxes(local, _at_origin(rois))
 
 
-def decode_rois(codes: Tensor, rois: Tensor) -> Tensor:
+def decode_rois(deltas: Tensor, rois: Tensor) -> Tensor:
     """Inverse of :func:`canonical_targets`: ``(R, 7)`` boxes in the world, headings in [-pi, pi)."""
-    local = decode_boxes(codes, _at_origin(rois))
-    centre = local_to_world(local[:, None, :3], rois)[:, 0]
-    return torch.cat((centre, local[:, 3:6], wrap_angle(local[:, 6:] + rois[:, 6:7])), dim=1)
+    local = decode_boxes(deltas, _at_origin(rois))
+    center = local_to_world(local[:, None, :3], rois)[:, 0]
+    return torch.cat((center, local[:, 3:6], wrap_angle(local[:, 6:] + rois[:, 6:7])), dim=1)
 
 
 def _at_origin(rois: Tensor) -> Tensor:
@@ -270,26 +270,26 @@ def corner_loss(predicted: Tensor, boxes: Tensor) -> Tensor:
     return smooth_l1(distance, 1.0).mean(dim=1)
 
 
-def roi_loss(cls: Tensor, codes: Tensor, targets: RoiTargets) -> dict[str, Tensor]:
+def roi_loss(cls: Tensor, deltas: Tensor, targets: RoiTargets) -> dict[str, Tensor]:
     """Compute the second stage's losses, all of weight 1.
 
     Args:
         cls: ``(R,)`` logits.
-        codes: ``(R, 7)`` box codes.
+        deltas: ``(R, 7)`` box deltas.
         targets: of the same regions.
 
     Returns:
         Scalars ``roi_cls`` (mean over regions), ``roi_box`` and ``roi_corner`` (mean over regions that regress).
     """
-    cls, codes = cls.float(), codes.float()
+    cls, deltas = cls.float(), deltas.float()
     classified = functional.binary_cross_entropy_with_logits(cls, targets.score, reduction="sum") / max(1, len(cls))
     regress = targets.regress
-    reach = 0.0 * codes.sum()  # keeps every parameter in the graph where nothing regresses
+    reach = 0.0 * deltas.sum()  # keeps every parameter in the graph where nothing regresses
     if not bool(regress.any()):
         return {"roi_cls": classified, "roi_box": reach, "roi_corner": reach}
-    rois, boxes, codes = targets.rois.boxes[regress], targets.boxes[regress], codes[regress]
-    box = smooth_l1(codes - canonical_targets(boxes, rois)).sum() / len(rois)
-    corner = corner_loss(decode_rois(codes, rois), boxes).mean()
+    rois, boxes, deltas = targets.rois.boxes[regress], targets.boxes[regress], deltas[regress]
+    box = smooth_l1(deltas - canonical_targets(boxes, rois)).sum() / len(rois)
+    corner = corner_loss(decode_rois(deltas, rois), boxes).mean()
     return {"roi_cls": classified, "roi_box": box, "roi_corner": corner}
 
 

@@ -27,11 +27,11 @@ class PoolLevel:
 
     stride: int
     """Voxels across a cell of this level."""
-    reach: tuple[int, int, int]
+    query_range: tuple[int, int, int]
     """Cells looked at on both sides (z, y, x)."""
     radius: float
     """Largest distance from grid point to cell centre, metres."""
-    samples: int = 16
+    max_samples: int = 16
     """Cells gathered at most."""
     channels: int = 32
     """Width of the gathered features."""
@@ -68,15 +68,15 @@ class _Gather(nn.Module):
         level, sites = self.level, cell_features.sites
         size = constant(grid.cell, points.device) * level.stride
         minimum = constant(grid.minimum, points.device)
-        centres = (sites.indices[:, 1:].flip(1) + 0.5) * size + minimum  # (V, 3)
+        centers = (sites.indices[:, 1:].flip(1) + 0.5) * size + minimum  # (V, 3)
         own = torch.cat((cells[:, :1], torch.div(cells[:, 1:], level.stride, rounding_mode="floor")), dim=1)
         kind = self.feature.weight.dtype
         features = _normed(self.feature(cell_features.features.to(kind)), self.feature_norm)  # (V, C)
-        where = (points, own, sites, centres, level.reach, level.radius, level.samples)
+        where = (points, own, sites, centers, level.query_range, level.radius, level.max_samples)
         if self.is_fused(features):
             described = pooled_query(*where, features, self.offset.weight, self.offset.bias)  # (M, C)
         else:
-            described = pooled(points, centres, voxel_query(*where), features, self.position)  # (M, C)
+            described = pooled(points, centers, voxel_query(*where), features, self.position)  # (M, C)
         return functional.relu(_normed(self.out(described), self.out_norm))
 
     def position(self, away: Tensor) -> Tensor:
@@ -109,19 +109,19 @@ def _normed(values: Tensor, norm: nn.Module) -> Tensor:
 class VoxelRoiPool(nn.Module):
     """Describe each region by features gathered at a lattice of points in it, from several levels."""
 
-    def __init__(self, in_channels: Sequence[int], levels: Sequence[PoolLevel], lattice: int = 6) -> None:
+    def __init__(self, in_channels: Sequence[int], levels: Sequence[PoolLevel], grid_size: int = 6) -> None:
         super().__init__()
-        self.lattice = lattice
-        steps = [(i + 0.5) / lattice - 0.5 for i in range(lattice)]
+        self.grid_size = grid_size
+        steps = [(i + 0.5) / grid_size - 0.5 for i in range(grid_size)]
         self.steps = tuple(product(steps, steps, steps))
         """Where the points of a region lie, in its sizes from its centre."""
         self.levels = nn.ModuleList(
             _Gather(channels, level) for channels, level in zip(in_channels, levels, strict=True)
         )
-        self.out_channels = lattice**3 * sum(level.channels for level in levels)
+        self.out_channels = grid_size**3 * sum(level.channels for level in levels)
 
     def grid_points(self, boxes: Tensor) -> Tensor:
-        """Return ``lattice ** 3`` points in each box, evenly spread, z fastest: ``(R, 7)`` -> ``(R, G, 3)``."""
+        """Return ``grid_size ** 3`` points in each box, evenly spread, z fastest: ``(R, 7)`` -> ``(R, G, 3)``."""
         local = constant(self.steps, boxes.device, torch.float32)  # (G, 3)
         return local_to_world(local * boxes[:, None, 3:6], boxes)
 
@@ -130,7 +130,7 @@ class VoxelRoiPool(nn.Module):
         points = self.grid_points(rois.boxes.detach()).flatten(0, 1)  # (R * G, 3)
         minimum, size = constant(grid.minimum, points.device), constant(grid.cell, points.device)
         cell = torch.div(points - minimum, size, rounding_mode="floor").long().flip(1)  # (R * G, 3) z, y, x
-        sample = rois.sample.repeat_interleave(self.lattice**3)
+        sample = rois.sample.repeat_interleave(self.grid_size**3)
         cells = torch.cat((sample[:, None], cell), dim=1)
         pooled = [gather(points, cells, level, grid) for gather, level in zip(self.levels, levels, strict=True)]
         return torch.cat(pooled, dim=1).reshape(len(rois.boxes), self.out_channels)
@@ -142,8 +142,8 @@ class RoiPredictions:
 
     cls: Tensor
     """``(R,)`` logits of the overlap score."""
-    codes: Tensor
-    """``(R, 7)`` box codes in the regions' frames."""
+    deltas: Tensor
+    """``(R, 7)`` box deltas in the regions' frames."""
 
 
 class RoiHead(nn.Module):
@@ -165,7 +165,7 @@ class RoiHead(nn.Module):
         """Predict from ``(R, in_channels)`` pooled features."""
         if len(pooled) == 1 and self.training:  # batch statistics need two values: the region counts twice
             twice = self(pooled.expand(2, -1))
-            return RoiPredictions(twice.cls[:1], twice.codes[:1])
+            return RoiPredictions(twice.cls[:1], twice.deltas[:1])
         shared = self.shared(pooled)  # (R, width)
         cls, box = self.cls_layers(shared), self.box_layers(shared)
         with torch.autocast(pooled.device.type, enabled=False):  # boxes to the millimetre: bfloat16 has three digits

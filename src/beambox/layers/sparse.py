@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from beambox.ops.sparse_conv import (
-    Geometry,
+    ConvSpec,
     Sites,
     SparseTensor,
     Triple,
@@ -44,12 +44,12 @@ class _Convolution(nn.Module):
     The weight has three dimensions so that a network with dense convolutions can be moved to ``channels_last``.
     """
 
-    def __init__(self, in_channels: int, channels: int, geometry: Geometry, bias: bool) -> None:
+    def __init__(self, in_channels: int, channels: int, spec: ConvSpec, bias: bool) -> None:
         super().__init__()
-        self.geometry = geometry
-        self.weight = nn.Parameter(torch.empty(geometry.offsets, in_channels, channels))
+        self.spec = spec
+        self.weight = nn.Parameter(torch.empty(spec.offsets, in_channels, channels))
         self.bias = nn.Parameter(torch.empty(channels)) if bias else None
-        bound = 1 / math.sqrt(geometry.offsets * in_channels)  # as torch's dense convolutions start
+        bound = 1 / math.sqrt(spec.offsets * in_channels)  # as torch's dense convolutions start
         nn.init.uniform_(self.weight, -bound, bound)
         if self.bias is not None:
             nn.init.uniform_(self.bias, -bound, bound)
@@ -57,7 +57,7 @@ class _Convolution(nn.Module):
     def kernel(self, scale: Tensor | None = None) -> Tensor:
         """Return the weight as ``(kz, ky, kx, C_in, C_out)``, each output channel multiplied by ``scale``."""
         weight = self.weight if scale is None else self.weight * scale
-        return weight.unflatten(0, self.geometry.kernel)
+        return weight.unflatten(0, self.spec.kernel)
 
 
 class SubmanifoldConv3d(_Convolution):
@@ -71,12 +71,12 @@ class SubmanifoldConv3d(_Convolution):
         dilation: int | Triple = 1,
         bias: bool = True,
     ) -> None:
-        super().__init__(in_channels, channels, Geometry.centred(triple(kernel), triple(dilation)), bias)
+        super().__init__(in_channels, channels, ConvSpec.centered(triple(kernel), triple(dilation)), bias)
 
     def forward(self, x: SparseTensor, scale: Tensor | None = None, shift: Tensor | None = None) -> SparseTensor:
         """Convolve; ``scale`` and ``shift``, one value an output channel, replace the bias by an affine map."""
         bias = _affine(self.bias, scale, shift)
-        return submanifold_conv3d(x, self.kernel(scale), bias, self.geometry.dilation)
+        return submanifold_conv3d(x, self.kernel(scale), bias, self.spec.dilation)
 
 
 class _Strided(_Convolution):
@@ -92,8 +92,8 @@ class _Strided(_Convolution):
         dilation: int | Triple = 1,
         bias: bool = True,
     ) -> None:
-        geometry = Geometry(triple(kernel), triple(stride), triple(padding), triple(dilation))
-        super().__init__(in_channels, channels, geometry, bias)
+        spec = ConvSpec(triple(kernel), triple(stride), triple(padding), triple(dilation))
+        super().__init__(in_channels, channels, spec, bias)
 
 
 class SparseConv3d(_Strided):
@@ -102,8 +102,8 @@ class SparseConv3d(_Strided):
     def forward(self, x: SparseTensor, scale: Tensor | None = None, shift: Tensor | None = None) -> SparseTensor:
         """Convolve; ``scale`` and ``shift``, one value an output channel, replace the bias by an affine map."""
         bias = _affine(self.bias, scale, shift)
-        geometry = self.geometry
-        return sparse_conv3d(x, self.kernel(scale), bias, geometry.stride, geometry.padding, geometry.dilation)
+        spec = self.spec
+        return sparse_conv3d(x, self.kernel(scale), bias, spec.stride, spec.padding, spec.dilation)
 
 
 class InverseConv3d(_Strided):
@@ -111,8 +111,8 @@ class InverseConv3d(_Strided):
 
     def forward(self, x: SparseTensor, onto: Sites) -> SparseTensor:
         """Carry features back onto ``onto``."""
-        geometry = self.geometry
-        return inverse_conv3d(x, self.kernel(), onto, self.bias, geometry.stride, geometry.padding, geometry.dilation)
+        spec = self.spec
+        return inverse_conv3d(x, self.kernel(), onto, self.bias, spec.stride, spec.padding, spec.dilation)
 
 
 def _affine(bias: Tensor | None, scale: Tensor | None, shift: Tensor | None) -> Tensor | None:
@@ -194,5 +194,5 @@ def levels_left(blocks: Iterable[nn.Module], levels: int) -> int:
     shape = (levels, 64, 64)
     for block in blocks:
         assert isinstance(block, SparseBlock)
-        shape = block.conv.geometry.output_shape(shape)
+        shape = block.conv.spec.output_shape(shape)
     return shape[0]

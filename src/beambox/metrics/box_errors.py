@@ -43,9 +43,9 @@ MIN_RECALL = 0.1
 class _Class(NamedTuple):
     """Boxes of one class in one frame."""
 
-    truth: Floats  # (N, 7)
+    gt: Floats  # (N, 7)
     counts: NDArray[np.bool_]  # (N,) false: ignored
-    found: Floats  # (M, 7), best first
+    det: Floats  # (M, 7), best first
     score: Floats  # (M,) descending
 
 
@@ -82,17 +82,17 @@ def greedy_pairs(quality: Floats, least: float) -> list[tuple[int, int]]:
     return pairs
 
 
-def signed_errors(truth: Floats, found: Floats) -> Floats:
+def signed_errors(gt: Floats, det: Floats) -> Floats:
     """Return detected minus labelled, ``(N, 10)``, in the order of ``COLUMNS``; metres and radians.
 
     Args:
-        truth: ``(N, 7)`` labelled boxes.
-        found: ``(N, 7)`` the detection of each.
+        gt: ``(N, 7)`` labelled boxes.
+        det: ``(N, 7)`` the detection of each.
     """
-    away = found - truth
+    away = det - gt
     x, y = away[:, 0], away[:, 1]
-    cos, sin = np.cos(truth[:, 6]), np.sin(truth[:, 6])
-    ray = np.arctan2(truth[:, 1], truth[:, 0])
+    cos, sin = np.cos(gt[:, 6]), np.sin(gt[:, 6])
+    ray = np.arctan2(gt[:, 1], gt[:, 0])
     turn = (away[:, 6] + math.pi / 2) % math.pi - math.pi / 2  # boxes look the same after half a turn
     columns = (x, y, away[:, 2], x * np.cos(ray) + y * np.sin(ray), x * cos + y * sin, y * cos - x * sin)
     return np.column_stack((*columns, away[:, 3:6], turn))
@@ -107,10 +107,10 @@ def countable(labels: Labels) -> NDArray[np.bool_]:
 
 
 def _of_class(frame: KittiFrame, name: str) -> _Class:
-    labels, found = frame.labels, frame.detections
+    labels, det = frame.labels, frame.detections
     mine = np.array([each.lower() == name.lower() for each in labels.names], dtype=np.bool_)
-    theirs = torch.tensor([each.lower() == name.lower() for each in found.names], dtype=torch.bool)
-    boxes, scores = found.boxes.detach().cpu()[theirs].double(), found.scores.detach().cpu()[theirs].double()
+    theirs = torch.tensor([each.lower() == name.lower() for each in det.names], dtype=torch.bool)
+    boxes, scores = det.boxes.detach().cpu()[theirs].double(), det.scores.detach().cpu()[theirs].double()
     order = torch.argsort(scores, descending=True, stable=True)
     return _Class(
         labels.boxes.double().numpy()[mine], countable(labels)[mine], boxes[order].numpy(), scores[order].numpy()
@@ -119,11 +119,11 @@ def _of_class(frame: KittiFrame, name: str) -> _Class:
 
 def _errors_of_class(name: str, frames: Sequence[_Class]) -> ClassErrors:
     errors, distances, all_distances, flips = [np.zeros((0, len(COLUMNS)))], [np.zeros(0)], [np.zeros(0)], 0
-    for truth, counts, found, _ in frames:
-        all_distances.append(np.hypot(truth[counts, 0], truth[counts, 1]))
-        pairs = greedy_pairs(rotated_overlaps(truth, found)[0], MIN_OVERLAP)
+    for gt, counts, det, _ in frames:
+        all_distances.append(np.hypot(gt[counts, 0], gt[counts, 1]))
+        pairs = greedy_pairs(rotated_overlaps(gt, det)[0], MIN_OVERLAP)
         kept = [pair for pair in pairs if counts[pair[0]]]
-        ours, theirs = truth[[row for row, _ in kept]], found[[column for _, column in kept]]
+        ours, theirs = gt[[row for row, _ in kept]], det[[column for _, column in kept]]
         errors.append(signed_errors(ours, theirs))
         distances.append(np.hypot(ours[:, 0], ours[:, 1]))
         flips += int((np.cos(theirs[:, 6] - ours[:, 6]) < 0).sum())
@@ -144,16 +144,16 @@ def _each(table: Floats, what: Callable[[Floats], Any]) -> dict[str, float]:
 def _nuscenes(frames: Sequence[_Class]) -> tuple[float, float, float]:
     """Return ATE, ASE and AOE: metres, 1 - IoU, radians; as the devkit has it, 1 below a recall of 0.1."""
     scores, rows, objects = [], [], 0
-    for truth, counts, found, score in frames:
+    for gt, counts, det, score in frames:
         objects += int(counts.sum())
-        apart = np.hypot(truth[:, None, 0] - found[None, :, 0], truth[:, None, 1] - found[None, :, 1])  # (N, M)
+        apart = np.hypot(gt[:, None, 0] - det[None, :, 0], gt[:, None, 1] - det[None, :, 1])  # (N, M)
         partner = {column: row for row, column in greedy_pairs(-apart, -NEAR)}
-        for column in range(len(found)):
+        for column in range(len(det)):
             row = partner.get(column)
             if row is not None and not counts[row]:
                 continue
             scores.append(score[column])
-            rows.append((math.nan,) * 3 if row is None else _distances(truth[row], found[column]))
+            rows.append((math.nan,) * 3 if row is None else _distances(gt[row], det[column]))
     if not objects:
         return math.nan, math.nan, math.nan
     order = np.argsort(-np.array(scores), kind="stable")
@@ -169,16 +169,17 @@ def _nuscenes(frames: Sequence[_Class]) -> tuple[float, float, float]:
     if last < first:
         return 1.0, 1.0, 1.0
     running = np.cumsum(table[right], axis=0) / np.arange(1, right.sum() + 1)[:, None]
-    held = score[right][::-1]
+    hit_scores = score[right][::-1]
     ate, ase, aoe = (
-        float(np.interp(confidence[::-1], held, running[::-1, i])[::-1][first : last + 1].mean()) for i in range(3)
+        float(np.interp(confidence[::-1], hit_scores, running[::-1, i])[::-1][first : last + 1].mean())
+        for i in range(3)
     )
     return ate, ase, aoe
 
 
-def _distances(truth: Floats, found: Floats) -> tuple[float, float, float]:
+def _distances(gt: Floats, det: Floats) -> tuple[float, float, float]:
     """Return the translation over the ground, 1 - IoU of the sizes alone, and the turn between the headings."""
-    shared = np.minimum(truth[3:6], found[3:6]).prod()
-    both = truth[3:6].prod() + found[3:6].prod() - shared
-    turn = abs((found[6] - truth[6] + math.pi) % (2 * math.pi) - math.pi)
-    return math.hypot(*(found[:2] - truth[:2])), 1 - float(shared / both) if both > 0 else 1.0, float(turn)
+    shared = np.minimum(gt[3:6], det[3:6]).prod()
+    both = gt[3:6].prod() + det[3:6].prod() - shared
+    turn = abs((det[6] - gt[6] + math.pi) % (2 * math.pi) - math.pi)
+    return math.hypot(*(det[:2] - gt[:2])), 1 - float(shared / both) if both > 0 else 1.0, float(turn)

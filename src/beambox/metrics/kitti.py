@@ -1,4 +1,4 @@
-"""KITTI's object detection benchmark: average precision in the image, seen from above, in 3-D, and with orientation.
+"""KITTI's object detection benchmark: average precision in the image, in BEV, in 3-D, and with orientation.
 
 The algorithm is that of the official C++ evaluator (KITTI devkit, ``evaluate_object``), for each class, difficulty and
 metric:
@@ -56,7 +56,7 @@ DEFAULT_OVERLAP = {
     "cyclist": 0.5,
 }
 """IoU above which a detection matches; KITTI names those of its three classes, the others follow them."""
-NEIGHBOUR = {"car": "van", "pedestrian": "person_sitting"}
+NEIGHBOR = {"car": "van", "pedestrian": "person_sitting"}
 """A class that is neither right nor wrong to detect."""
 SAMPLES = 41
 
@@ -99,10 +99,10 @@ def evaluate(
     """Score detections in memory.
 
     Args:
-        frames: one entry a frame; without a calibration only ``no_difficulty`` is possible.
+        frames: one entry per frame; without a calibration only ``no_difficulty`` is possible.
         classes: to score; None takes the classes of the detector.
         min_overlap: IoU thresholds other than ``DEFAULT_OVERLAP``, by class.
-        no_difficulty: score every object, one AP a class, seen from above and in 3-D; for data without a camera.
+        no_difficulty: score every object, one AP per class, in BEV and in 3-D; for data without a camera.
         python_port: ignore a label box of exactly the minimum height, as the widespread Python port does.
 
     Raises:
@@ -113,15 +113,15 @@ def evaluate(
         frame = entry if isinstance(entry, KittiFrame) else KittiFrame(*entry)
         known.update(dict.fromkeys(frame.detections.classes))
         calibration = None if no_difficulty else frame.calibration
-        truth = objects_from_labels(frame.labels, calibration)
-        found = objects_from_detections(frame.detections, calibration, frame.image_size)
-        if not no_difficulty and not (truth.has_camera and found.has_camera):
+        gt = objects_from_labels(frame.labels, calibration)
+        det = objects_from_detections(frame.detections, calibration, frame.image_size)
+        if not no_difficulty and not (gt.has_camera and det.has_camera):
             lacks = "image attributes" if frame.calibration is not None else "camera calibration"
             raise BeamboxError(
                 f"frame {frame.detections.frame_id or number} has no {lacks}, without which KITTI's difficulty levels "
                 "cannot be told; give label files with a camera or score with no_difficulty=True"
             )
-        pairs.append((truth, found))
+        pairs.append((gt, det))
     return _evaluate(pairs, classes or tuple(known) or CLASSES, min_overlap, no_difficulty, python_port)
 
 
@@ -140,7 +140,7 @@ def evaluate_files(
 
     Args:
         labels: folder of label files, or a KITTI root.
-        results: folder of result files, one a frame; an empty file says that nothing was found.
+        results: folder of result files, one per frame; an empty file says that nothing was found.
         frames: names of the frames; None takes every label file.
         classes: to score.
         min_overlap: as for :func:`evaluate`.
@@ -177,18 +177,18 @@ def score_thresholds(scores: Floats, objects: int) -> Floats:
 class _Rows(NamedTuple):
     """Columns of all frames in one row, and the overlaps of each frame."""
 
-    truth_name: NDArray[np.str_]
-    found_name: NDArray[np.str_]
-    truth_height: Floats
-    found_height: Floats
+    gt_name: NDArray[np.str_]
+    det_name: NDArray[np.str_]
+    gt_height: Floats
+    det_height: Floats
     occlusion: Floats
     truncation: Floats
     score: Floats
-    truth_alpha: Floats
-    found_alpha: Floats
-    spared_share: Floats
-    truth_start: NDArray[np.int64]
-    found_start: NDArray[np.int64]
+    gt_alpha: Floats
+    det_alpha: Floats
+    dontcare_overlap: Floats
+    gt_start: NDArray[np.int64]
+    det_start: NDArray[np.int64]
     pair_start: NDArray[np.int64]
     image: Floats
     bev: Floats
@@ -199,26 +199,26 @@ def _rows(pairs: Sequence[tuple[Objects, Objects]]) -> _Rows:
     def join(parts: Iterable[Floats]) -> Floats:
         return np.concatenate([np.zeros(0), *(part.reshape(-1) for part in parts)])
 
-    truths, founds = [truth for truth, _ in pairs], [found for _, found in pairs]
-    rotated = [rotated_overlaps(truth.box, found.box) for truth, found in pairs]
-    sizes = [(len(truth), len(found)) for truth, found in pairs]
-    truth_image = np.concatenate([truth.image for truth in truths])
-    found_image = np.concatenate([found.image for found in founds])
+    gts, dets = [gt for gt, _ in pairs], [det for _, det in pairs]
+    rotated = [rotated_overlaps(gt.box, det.box) for gt, det in pairs]
+    sizes = [(len(gt), len(det)) for gt, det in pairs]
+    gt_image = np.concatenate([gt.image for gt in gts])
+    det_image = np.concatenate([det.image for det in dets])
     return _Rows(
-        truth_name=np.array([name for truth in truths for name in truth.names], dtype=np.str_),
-        found_name=np.array([name for found in founds for name in found.names], dtype=np.str_),
-        truth_height=truth_image[:, 3] - truth_image[:, 1],
-        found_height=np.trunc(np.abs(found_image[:, 3] - found_image[:, 1])),  # the devkit keeps it as an integer
-        occlusion=join(truth.occlusion for truth in truths),
-        truncation=join(truth.truncation for truth in truths),
-        score=join(found.score for found in founds),
-        truth_alpha=join(truth.alpha for truth in truths),
-        found_alpha=join(found.alpha for found in founds),
-        spared_share=join(covered_share(found.image, truth.ignored_image) for truth, found in pairs),
-        truth_start=starts([t for t, _ in sizes]),
-        found_start=starts([d for _, d in sizes]),
+        gt_name=np.array([name for gt in gts for name in gt.names], dtype=np.str_),
+        det_name=np.array([name for det in dets for name in det.names], dtype=np.str_),
+        gt_height=gt_image[:, 3] - gt_image[:, 1],
+        det_height=np.trunc(np.abs(det_image[:, 3] - det_image[:, 1])),  # the devkit keeps it as an integer
+        occlusion=join(gt.occlusion for gt in gts),
+        truncation=join(gt.truncation for gt in gts),
+        score=join(det.score for det in dets),
+        gt_alpha=join(gt.alpha for gt in gts),
+        det_alpha=join(det.alpha for det in dets),
+        dontcare_overlap=join(covered_share(det.image, gt.ignored_image) for gt, det in pairs),
+        gt_start=starts([t for t, _ in sizes]),
+        det_start=starts([d for _, d in sizes]),
         pair_start=starts([t * d for t, d in sizes]),
-        image=join(image_overlap(truth.image, found.image) for truth, found in pairs),
+        image=join(image_overlap(gt.image, det.image) for gt, det in pairs),
         bev=join(bev for bev, _ in rotated),
         box3d=join(box for _, box in rotated),
     )
@@ -236,7 +236,7 @@ def _evaluate(
     overlaps = _overlaps_of(classes, min_overlap or {})
     rows = _rows(pairs)
     levels = EVERYBODY if no_difficulty else LEVELS
-    oriented = not bool((rows.found_alpha == -10).any())
+    oriented = not bool((rows.det_alpha == -10).any())
     results = tuple(
         _evaluate_class(rows, name, overlap, levels, python_port, not no_difficulty, oriented)
         for name, overlap in overlaps.items()
@@ -279,25 +279,25 @@ def _evaluate_class(
         for into, overlap in ((box3d, rows.box3d), (bev, rows.bev)):
             into.append(_average(_table(rows, flags, overlap, min_overlap, nothing_spared), False)[0])
         if camera:
-            spared = rows.spared_share > min_overlap
+            spared = rows.dontcare_overlap > min_overlap
             flat, turned = _average(_table(rows, flags, rows.image, min_overlap, spared), oriented)
             image.append(flat)
             orientation.append(turned)
-    labelled = int((rows.truth_name == name.lower()).sum())
+    labeled = int((rows.gt_name == name.lower()).sum())
     averages = (tuple(box3d), tuple(bev), tuple(image), tuple(orientation))  # the last two empty without a camera
-    return ClassResult(name, min_overlap, tuple(objects), *averages, labelled)
+    return ClassResult(name, min_overlap, tuple(objects), *averages, labeled)
 
 
 def _flags(rows: _Rows, name: str, level: Difficulty, python_port: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    low = rows.truth_height <= level.min_height if python_port else rows.truth_height < level.min_height
+    low = rows.gt_height <= level.min_height if python_port else rows.gt_height < level.min_height
     unseen = low | (rows.occlusion > level.max_occlusion) | (rows.truncation > level.max_truncation)
-    truth = np.full(len(rows.truth_name), -1)
-    truth[rows.truth_name == NEIGHBOUR.get(name, "")] = 1
-    valid = rows.truth_name == name
-    truth[valid] = np.where(unseen[valid], 1, 0)
-    found = np.where(rows.found_name == name, 0, -1)
-    found[rows.found_height < level.min_height] = 1  # whatever its class
-    return truth, found
+    gt = np.full(len(rows.gt_name), -1)
+    gt[rows.gt_name == NEIGHBOR.get(name, "")] = 1
+    valid = rows.gt_name == name
+    gt[valid] = np.where(unseen[valid], 1, 0)
+    det = np.where(rows.det_name == name, 0, -1)
+    det[rows.det_height < level.min_height] = 1  # whatever its class
+    return gt, det
 
 
 def _table(
@@ -305,20 +305,20 @@ def _table(
     flags: tuple[NDArray[np.int64], NDArray[np.int64]],
     overlap: Floats,
     min_overlap: float,
-    spares: NDArray[np.bool_],
+    dontcare: NDArray[np.bool_],
 ) -> MatchTable:
     return MatchTable(
-        rows.truth_start,
-        rows.found_start,
+        rows.gt_start,
+        rows.det_start,
         rows.pair_start,
         overlap,
         min_overlap,
         flags[0],
         flags[1],
         rows.score,
-        spares,
-        rows.truth_alpha,
-        rows.found_alpha,
+        dontcare,
+        rows.gt_alpha,
+        rows.det_alpha,
     )
 
 

@@ -192,7 +192,7 @@ def _folder(folder: Path, inner: Sequence[str], what: str) -> Path:
 
 
 def read_frame_list(path: Path) -> list[str]:
-    """Read frame names, one a line, as ImageSets/val.txt has them.
+    """Read frame names, one per line, as ImageSets/val.txt has them.
 
     Raises:
         BeamboxError: if the list is not there, empty, or names a frame twice.
@@ -209,7 +209,7 @@ def read_pairs(
 
     Args:
         labels: folder of label files, or a KITTI root above ``training/label_2``.
-        results: folder of result files, one a frame (an empty file: nothing found), or the folder above ``data``.
+        results: folder of result files, one per frame (an empty file: nothing found), or the folder above ``data``.
         frames: names without suffix; None takes every label file.
         allow_missing: read a missing result file as an empty one.
 
@@ -228,7 +228,7 @@ def read_pairs(
     have = {path.stem for path in results.glob("*.txt")}
     missing = [name for name in names if name not in have]
     if missing and not allow_missing:
-        hint = " or score only the frames of a list, --frames ImageSets/val.txt" if frames is None else ""
+        hint = " or score only the frames of a list, --frame-list ImageSets/val.txt" if frames is None else ""
         raise MissingFileError(
             f"{len(missing)} of {len(names)} frames have no result file in {results}, the first is {missing[0]}.txt; "
             f"write an empty file where nothing was found, pass --allow-missing{hint}"
@@ -239,11 +239,11 @@ def read_pairs(
         if not label.is_file():
             raise MissingFileError(f"frame {name} has no label file {label}")
         result = results / f"{name}.txt"
-        found = read_text(result) if name in have else ""
+        det = read_text(result) if name in have else ""
         pairs.append(
             (
                 parse_objects(read_text(label), str(label), scored=False),
-                parse_objects(found, str(result), scored=True),
+                parse_objects(det, str(result), scored=True),
             )
         )
     return pairs

@@ -48,12 +48,12 @@ class ClassResult:
     box3d: tuple[AveragePrecision, ...]
     """By 3-D IoU."""
     bev: tuple[AveragePrecision, ...]
-    """By the IoU seen from above."""
+    """By the IoU in BEV."""
     image: tuple[AveragePrecision, ...] = ()
     """By the IoU in the image; empty without a camera."""
     orientation: tuple[AveragePrecision, ...] = ()
     """AOS: average orientation similarity, bounded by the AP in the image; empty without a camera."""
-    labelled: int = 0
+    labeled: int = 0
     """Ground-truth boxes of the class, whether they count at a level or not."""
 
     def metrics(self) -> list[tuple[str, tuple[AveragePrecision, ...]]]:
@@ -139,10 +139,10 @@ class KittiResult:
 
 
 def _nothing_counts(result: ClassResult) -> str:
-    if not result.labelled:
+    if not result.labeled:
         return f"the labels have no {result.name}"
     return (
-        f"the labels have {result.labelled} {result.name}, but none that KITTI's levels count (an image box of 25 "
+        f"the labels have {result.labeled} {result.name}, but none that KITTI's levels count (an image box of 25 "
         "pixels or more, seen well enough): --no-difficulty counts every object"
     )
 
@@ -150,7 +150,7 @@ def _nothing_counts(result: ClassResult) -> str:
 def _advice(graded: bool) -> list[str]:
     if not graded:
         return [
-            "every object counts, no difficulty levels; 3d and bev are IoU in 3-D and seen from above",
+            "every object counts, no difficulty levels; 3d and bev are IoU in 3-D and in BEV",
             "R40, R11: official 40 and 11 recalls; all: every recall, to be read where a class has few objects",
         ]
     return [

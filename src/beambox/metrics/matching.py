@@ -24,13 +24,13 @@ Integers = NDArray[np.int64]
 class MatchTable:
     """Flags, scores and overlaps of one class under one metric; the boxes of all frames stand in one row.
 
-    Ground truth of frame f lies in ``truth_start[f]:truth_start[f + 1]``, detections in ``found_start[...]`` likewise,
+    Ground truth of frame f lies in ``gt_start[f]:gt_start[f + 1]``, detections in ``det_start[...]`` likewise,
     and their overlaps in ``overlap[pair_start[f]:pair_start[f + 1]]``, ground truth by detections, row after row.
     """
 
-    truth_start: Integers
+    gt_start: Integers
     """``(F + 1,)``."""
-    found_start: Integers
+    det_start: Integers
     """``(F + 1,)``."""
     pair_start: Integers
     """``(F + 1,)``."""
@@ -38,28 +38,28 @@ class MatchTable:
     """``(P,)`` in [0, 1]."""
     min_overlap: float
     """A pair matches where its overlap is greater."""
-    truth_flag: Integers
+    gt_flag: Integers
     """``(G,)`` 0 counts, 1 ignored, -1 takes no part."""
-    found_flag: Integers
+    det_flag: Integers
     """``(D,)`` likewise."""
     score: Floats
     """``(D,)``."""
-    spares: NDArray[np.bool_]
+    dontcare: NDArray[np.bool_]
     """``(D,)`` detections that are no false positives where nothing matches them (KITTI's DontCare regions)."""
-    truth_alpha: Floats
+    gt_alpha: Floats
     """``(G,)`` observation angles, radians; zeros where no orientation is scored."""
-    found_alpha: Floats
+    det_alpha: Floats
     """``(D,)`` likewise."""
 
     @property
     def objects(self) -> int:
         """Number of ground-truth boxes that count."""
-        return int((self.truth_flag == 0).sum())
+        return int((self.gt_flag == 0).sum())
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What is counted when all detections with at least a given score are kept; one row a score, best first."""
+    """What is counted when all detections with at least a given score are kept; one row per score, best first."""
 
     score: Floats
     """``(K,)`` strictly descending."""
@@ -93,13 +93,13 @@ def true_positive_scores(table: MatchTable) -> Floats:
     This is the first pass of both benchmarks: their score thresholds are chosen among these.
     """
     scores = _first_pass(
-        table.truth_start,
-        table.found_start,
+        table.gt_start,
+        table.det_start,
         table.pair_start,
         table.overlap,
         table.min_overlap,
-        table.truth_flag,
-        table.found_flag,
+        table.gt_flag,
+        table.det_flag,
         table.score,
     )
     return np.sort(scores)[::-1]
@@ -109,17 +109,17 @@ def count(table: MatchTable) -> Counts:
     """Count true positives, false positives and misses at every distinct score."""
     changes = np.zeros((len(table.score), 4))
     _second_pass(
-        table.truth_start,
-        table.found_start,
+        table.gt_start,
+        table.det_start,
         table.pair_start,
         table.overlap,
         table.min_overlap,
-        table.truth_flag,
-        table.found_flag,
+        table.gt_flag,
+        table.det_flag,
         table.score,
-        table.spares,
-        table.truth_alpha,
-        table.found_alpha,
+        table.dontcare,
+        table.gt_alpha,
+        table.det_alpha,
         changes,
     )
     order = np.argsort(-table.score, kind="stable")
@@ -158,28 +158,26 @@ def all_point_ap(counts: Counts, curve: Floats) -> float:
 
 
 @njit(cache=True)
-def _first_pass(
-    truth_start, found_start, pair_start, overlap, min_overlap, truth_flag, found_flag, score
-):  # pragma: no cover
+def _first_pass(gt_start, det_start, pair_start, overlap, min_overlap, gt_flag, det_flag, score):  # pragma: no cover
     out = np.empty(len(score))
     size = 0
-    for frame in range(len(truth_start) - 1):
-        first, number = found_start[frame], found_start[frame + 1] - found_start[frame]
+    for frame in range(len(gt_start) - 1):
+        first, number = det_start[frame], det_start[frame + 1] - det_start[frame]
         taken = np.zeros(number, dtype=np.bool_)
-        for truth in range(truth_start[frame], truth_start[frame + 1]):
-            if truth_flag[truth] < 0:
+        for gt in range(gt_start[frame], gt_start[frame + 1]):
+            if gt_flag[gt] < 0:
                 continue
-            row = pair_start[frame] + (truth - truth_start[frame]) * number
+            row = pair_start[frame] + (gt - gt_start[frame]) * number
             chosen = -1
             for j in range(number):
-                if taken[j] or found_flag[first + j] < 0 or not overlap[row + j] > min_overlap:
+                if taken[j] or det_flag[first + j] < 0 or not overlap[row + j] > min_overlap:
                     continue
                 if chosen < 0 or score[first + j] > score[first + chosen]:
                     chosen = j
             if chosen < 0:
                 continue
             taken[chosen] = True
-            if truth_flag[truth] == 0 and found_flag[first + chosen] == 0:
+            if gt_flag[gt] == 0 and det_flag[first + chosen] == 0:
                 out[size] = score[first + chosen]
                 size += 1
     return out[:size]
@@ -187,31 +185,31 @@ def _first_pass(
 
 @njit(cache=True)
 def _second_pass(
-    truth_start,
-    found_start,
+    gt_start,
+    det_start,
     pair_start,
     overlap,
     min_overlap,
-    truth_flag,
-    found_flag,
+    gt_flag,
+    det_flag,
     score,
-    spares,
-    truth_alpha,
-    found_alpha,
+    dontcare,
+    gt_alpha,
+    det_alpha,
     changes,
 ):  # pragma: no cover
     """Write into ``changes[d]`` how TP, FP, FN and similarity change when the threshold falls to ``score[d]``."""
-    for frame in range(len(truth_start) - 1):
-        truths = slice(truth_start[frame], truth_start[frame + 1])
-        founds = slice(found_start[frame], found_start[frame + 1])
-        truth_flags, found_flags, scores = truth_flag[truths], found_flag[founds], score[founds]
-        pairs = overlap[pair_start[frame] : pair_start[frame + 1]].reshape(len(truth_flags), len(found_flags))
-        candidates = _candidates(pairs, min_overlap, truth_flags, found_flags)
+    for frame in range(len(gt_start) - 1):
+        gts = slice(gt_start[frame], gt_start[frame + 1])
+        dets = slice(det_start[frame], det_start[frame + 1])
+        gt_flags, det_flags, scores = gt_flag[gts], det_flag[dets], score[dets]
+        pairs = overlap[pair_start[frame] : pair_start[frame + 1]].reshape(len(gt_flags), len(det_flags))
+        candidates = _candidates(pairs, min_overlap, gt_flags, det_flags)
         alone = np.ones(len(scores), dtype=np.bool_)
         alone[candidates] = False
         for j in range(len(scores)):
-            if alone[j] and found_flags[j] == 0 and not spares[founds][j]:
-                changes[founds][j, 1] += 1.0
+            if alone[j] and det_flags[j] == 0 and not dontcare[dets][j]:
+                changes[dets][j, 1] += 1.0
         order = np.argsort(-scores[candidates])
         before = np.zeros(4)
         for k in range(len(candidates)):
@@ -221,46 +219,46 @@ def _second_pass(
             after = _match_frame(
                 pairs,
                 min_overlap,
-                truth_flags,
-                found_flags,
+                gt_flags,
+                det_flags,
                 scores,
-                spares[founds],
-                truth_alpha[truths],
-                found_alpha[founds],
+                dontcare[dets],
+                gt_alpha[gts],
+                det_alpha[dets],
                 candidates,
                 scores[last],
             )
-            changes[founds][last] += after - before
+            changes[dets][last] += after - before
             before = after
 
 
 @njit(cache=True)
-def _candidates(pairs, min_overlap, truth_flag, found_flag):  # pragma: no cover
+def _candidates(pairs, min_overlap, gt_flag, det_flag):  # pragma: no cover
     """Return the detections of a frame that could match something, in file order."""
-    keep = np.zeros(len(found_flag), dtype=np.bool_)
-    for i in range(len(truth_flag)):
-        for j in range(len(found_flag)):
-            if truth_flag[i] >= 0 and found_flag[j] >= 0 and pairs[i, j] > min_overlap:
+    keep = np.zeros(len(det_flag), dtype=np.bool_)
+    for i in range(len(gt_flag)):
+        for j in range(len(det_flag)):
+            if gt_flag[i] >= 0 and det_flag[j] >= 0 and pairs[i, j] > min_overlap:
                 keep[j] = True
     return np.flatnonzero(keep)
 
 
 @njit(cache=True)
 def _match_frame(
-    pairs, min_overlap, truth_flag, found_flag, score, spares, truth_alpha, found_alpha, candidates, threshold
+    pairs, min_overlap, gt_flag, det_flag, score, dontcare, gt_alpha, det_alpha, candidates, threshold
 ):  # pragma: no cover
     """Match one frame at one threshold by overlap; TP, FP, FN less the number of objects, similarity."""
     counted = np.zeros(4)
     taken = score[candidates] < threshold  # those below the threshold take no part
-    for i in range(len(truth_flag)):
-        if truth_flag[i] < 0:
+    for i in range(len(gt_flag)):
+        if gt_flag[i] < 0:
             continue
         chosen, largest, chosen_ignored = -1, 0.0, False
         for k in range(len(candidates)):
             j = candidates[k]
             if taken[k] or not pairs[i, j] > min_overlap:
                 continue
-            if found_flag[j] == 0:
+            if det_flag[j] == 0:
                 if pairs[i, j] > largest or chosen_ignored:
                     chosen, largest, chosen_ignored = k, pairs[i, j], False
             elif chosen < 0:
@@ -268,13 +266,13 @@ def _match_frame(
         if chosen < 0:
             continue
         taken[chosen] = True
-        if truth_flag[i] == 0:
+        if gt_flag[i] == 0:
             counted[2] -= 1.0
             if not chosen_ignored:
                 counted[0] += 1.0
-                counted[3] += (1.0 + np.cos(truth_alpha[i] - found_alpha[candidates[chosen]])) / 2.0
+                counted[3] += (1.0 + np.cos(gt_alpha[i] - det_alpha[candidates[chosen]])) / 2.0
     for k in range(len(candidates)):
         j = candidates[k]
-        if not taken[k] and found_flag[j] == 0 and not spares[j]:
+        if not taken[k] and det_flag[j] == 0 and not dontcare[j]:
             counted[1] += 1.0
     return counted

@@ -54,7 +54,7 @@ LIMITS = ((0.0, math.inf), (0.0, 30.0), (30.0, 50.0), (50.0, math.inf))
 """Distance of each band, metres; the upper end does not belong to it."""
 SAMPLES = 51
 FARTHEST_PAIR = 5.0
-"""Centres, seen from above, farther apart than this many metres do not overlap."""
+"""Centres, in BEV, farther apart than this many metres do not overlap."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +90,13 @@ def evaluate(
         BeamboxError: if there is no frame, a threshold is given for a class that is not scored, or none is known.
     """
     pairs = []
-    for labels, found in frames:
-        truth_boxes, boxes = labels.boxes.double(), found.boxes.detach().cpu().double()
-        for each in (truth_boxes, boxes):
+    for labels, det in frames:
+        gt_boxes, boxes = labels.boxes.double(), det.boxes.detach().cpu().double()
+        for each in (gt_boxes, boxes):
             each[:, 6] = wrap_angle(each[:, 6])
-        truth = OnceBoxes(labels.names, truth_boxes.numpy(), np.zeros(len(labels)))
-        scores = found.scores.detach().cpu().double().numpy()
-        pairs.append((truth, OnceBoxes(tuple(found.names), boxes.numpy(), scores)))
+        gt = OnceBoxes(labels.names, gt_boxes.numpy(), np.zeros(len(labels)))
+        scores = det.scores.detach().cpu().double().numpy()
+        pairs.append((gt, OnceBoxes(tuple(det.names), boxes.numpy(), scores)))
     return evaluate_boxes(
         pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation, known=known
     )
@@ -126,30 +126,30 @@ def evaluate_annotations(
         BeamboxError: naming the file and the key that cannot be used.
     """
     content = _read(annotations)
-    truths = _entries(content, "ground_truth", annotations)
-    founds = (
+    gts = _entries(content, "ground_truth", annotations)
+    dets = (
         _entries(content, "predictions", annotations)
         if results is None
         else _entries(_read(results), "predictions", results)
     )
     source = annotations if results is None else results
-    found_by_id = {_frame_id(entry): entry for entry in founds}
-    annotated = [_frame_id(entry) for entry in truths]
-    for where, names in ((annotations, annotated), (source, [_frame_id(entry) for entry in founds])):
+    det_by_id = {_frame_id(entry): entry for entry in dets}
+    annotated = [_frame_id(entry) for entry in gts]
+    for where, names in ((annotations, annotated), (source, [_frame_id(entry) for entry in dets])):
         repeated = next((name for name, count in Counter(names).items() if count > 1), None)
         if repeated is not None:
             raise BeamboxError(f"{where} must hold each frame once, but holds {repeated} again")
-    missing = [name for name in annotated if name not in found_by_id]
+    missing = [name for name in annotated if name not in det_by_id]
     if missing:
         raise BeamboxError(
             f"{source}: {len(missing)} of {len(annotated)} annotated frames have no predictions, the first is "
             f"{min(missing)}; write an entry with empty lists where nothing was found"
         )
     pairs = []
-    for entry in truths:
+    for entry in gts:
         name = _frame_id(entry)
-        truth = _boxes(entry, f"{annotations}, ground truth of frame {name}", scored=False)
-        pairs.append((truth, _boxes(found_by_id[name], f"{source}, predictions of frame {name}", scored=True)))
+        gt = _boxes(entry, f"{annotations}, ground truth of frame {name}", scored=False)
+        pairs.append((gt, _boxes(det_by_id[name], f"{source}, predictions of frame {name}", scored=True)))
     return evaluate_boxes(
         pairs, five_classes=five_classes, min_overlap=min_overlap, true_rotation=true_rotation, known=known
     )
@@ -178,32 +178,30 @@ def evaluate_boxes(
             raise BeamboxError(
                 f"ONCE's metric scores {', '.join(all_names)}; the detector knows {', '.join(known) or 'no class'}"
             )
-    truth_name = np.array([merge.get(name, name) for truth, _ in pairs for name in truth.names], dtype=np.str_)
-    found_name = np.array([merge.get(name, name) for _, found in pairs for name in found.names], dtype=np.str_)
-    truth_range, found_range = (
+    gt_name = np.array([merge.get(name, name) for gt, _ in pairs for name in gt.names], dtype=np.str_)
+    det_name = np.array([merge.get(name, name) for _, det in pairs for name in det.names], dtype=np.str_)
+    gt_range, det_range = (
         np.concatenate([np.linalg.norm(pair[side].boxes[:, :3], axis=1) for pair in pairs]) for side in (0, 1)
     )
-    overlap = np.concatenate(
-        [gated_overlap(truth.boxes, found.boxes, true_rotation).reshape(-1) for truth, found in pairs]
-    )
-    sizes = [(len(truth.names), len(found.names)) for truth, found in pairs]
-    scores = np.concatenate([found.scores for _, found in pairs])
+    overlap = np.concatenate([gated_overlap(gt.boxes, det.boxes, true_rotation).reshape(-1) for gt, det in pairs])
+    sizes = [(len(gt.names), len(det.names)) for gt, det in pairs]
+    scores = np.concatenate([det.scores for _, det in pairs])
     nothing = np.zeros(len(scores), dtype=np.bool_)
     values, objects = [], []
     for name, minimum in minima.items():
         tables = [
             MatchTable(
-                truth_start=starts([t for t, _ in sizes]),
-                found_start=starts([d for _, d in sizes]),
+                gt_start=starts([t for t, _ in sizes]),
+                det_start=starts([d for _, d in sizes]),
                 pair_start=starts([t * d for t, d in sizes]),
                 overlap=overlap,
                 min_overlap=minimum,
-                truth_flag=_flags(truth_name == name, truth_range, band),
-                found_flag=_flags(found_name == name, found_range, band),
+                gt_flag=_flags(gt_name == name, gt_range, band),
+                det_flag=_flags(det_name == name, det_range, band),
                 score=scores,
-                spares=nothing,
-                truth_alpha=np.zeros(len(truth_name)),
-                found_alpha=np.zeros(len(found_name)),
+                dontcare=nothing,
+                gt_alpha=np.zeros(len(gt_name)),
+                det_alpha=np.zeros(len(det_name)),
             )
             for band in LIMITS
         ]
@@ -225,34 +223,34 @@ def _with_known_names(
     unknown: Counter[str] = Counter(
         name for pair in pairs for side in pair for name in side.names if name.lower() not in _KNOWN_NAMES
     )
-    told = []
+    unknown_names = []
     for name, boxes in unknown.most_common():
         meant = ELSEWHERE.get(name.lower())
         hint = f' (did you mean "{meant}"?)' if meant else did_you_mean(name, FIVE_CLASSES)
-        told.append(f"{name}, {boxes} boxes{hint}")
+        unknown_names.append(f"{name}, {boxes} boxes{hint}")
 
     def named(side: OnceBoxes) -> OnceBoxes:
         return replace(side, names=tuple(_KNOWN_NAMES.get(name.lower(), name) for name in side.names))
 
-    return [(named(truth), named(found)) for truth, found in pairs], tuple(told)
+    return [(named(gt), named(det)) for gt, det in pairs], tuple(unknown_names)
 
 
-def gated_overlap(truth: Floats, found: Floats, true_rotation: bool = False) -> Floats:
+def gated_overlap(gt: Floats, det: Floats, true_rotation: bool = False) -> Floats:
     """Return the 3-D IoU as the devkit has it, 0 for far pairs and opposed headings.
 
     Args:
-        truth: ``(N, 7)``.
-        found: ``(M, 7)``.
+        gt: ``(N, 7)``.
+        det: ``(M, 7)``.
         true_rotation: turn boxes counter-clockwise instead of clockwise.
 
     Returns:
         ``(N, M)``.
     """
     sense = np.array([1, 1, 1, 1, 1, 1, 1 if true_rotation else -1])
-    overlap = rotated_overlaps(truth * sense, found * sense)[1]
-    turn = np.abs(truth[:, None, 6] - found[None, :, 6])
+    overlap = rotated_overlaps(gt * sense, det * sense)[1]
+    turn = np.abs(gt[:, None, 6] - det[None, :, 6])
     turn = np.where(turn >= math.pi, 2 * math.pi - turn, turn)
-    apart = np.hypot(truth[:, None, 0] - found[None, :, 0], truth[:, None, 1] - found[None, :, 1])
+    apart = np.hypot(gt[:, None, 0] - det[None, :, 0], gt[:, None, 1] - det[None, :, 1])
     return np.where((turn > math.pi / 2) | (apart > FARTHEST_PAIR), 0.0, overlap)
 
 
@@ -344,11 +342,13 @@ def _boxes(entry: Mapping[str, Any], where: str, scored: bool) -> OnceBoxes:
         if scores.ndim != 1:
             raise ValueError(f"got scores of shape {scores.shape}")
     except (TypeError, ValueError, OverflowError) as error:
-        told = str(error)[:120]
-        raise BeamboxError(f"{where}: boxes_3d must be rows of x y z l w h yaw and scores numbers, {told}") from None
+        unknown_names = str(error)[:120]
+        raise BeamboxError(
+            f"{where}: boxes_3d must be rows of x y z l w h yaw and scores numbers, {unknown_names}"
+        ) from None
     if not len(names) == len(boxes) == len(scores):
-        told = f"{len(names)} names, {len(boxes)} boxes_3d" + (f", {len(scores)} scores" if scored else "")
-        raise BeamboxError(f"{where}: lists must have one length, got {told}")
+        unknown_names = f"{len(names)} names, {len(boxes)} boxes_3d" + (f", {len(scores)} scores" if scored else "")
+        raise BeamboxError(f"{where}: lists must have one length, got {unknown_names}")
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
         raise BeamboxError(f"{where}: boxes_3d and scores must be finite numbers")
     return OnceBoxes(names, boxes, scores)

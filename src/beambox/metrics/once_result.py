@@ -25,7 +25,7 @@ class OnceResult:
     iou: tuple[float, ...]
     """Threshold of each class."""
     ap: tuple[tuple[float, ...], ...]
-    """A row a class, a column a band."""
+    """A row per class, a column per band."""
     objects: tuple[tuple[int, ...], ...]
     """Number of ground-truth boxes that count, likewise."""
     frames: int
@@ -36,7 +36,7 @@ class OnceResult:
     """Names, with what to do, of boxes left out because ONCE has no such class."""
 
     def mean(self) -> tuple[float, ...]:
-        """Return the plain mean over the classes scored, one value a band; of all classes the first is the mAP."""
+        """Return the plain mean over the classes scored, one value per band; of all classes the first is the mAP."""
         return tuple(sum(column) / len(column) for column in zip(*self.ap))
 
     def to_json(self) -> dict[str, dict[str, float]]:

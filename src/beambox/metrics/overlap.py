@@ -49,14 +49,14 @@ def covered_share(boxes: Floats, regions: Floats) -> Floats:
 
 
 def rotated_overlaps(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Return the IoU seen from above and in 3-D.
+    """Return the IoU in BEV and in 3-D.
 
     Args:
         a: ``(N, 7)`` boxes x, y, z, l, w, h, yaw; metres, radians.
         b: ``(M, 7)``.
 
     Returns:
-        ``(N, M)`` seen from above, ``(N, M)`` in 3-D.
+        ``(N, M)`` in BEV, ``(N, M)`` in 3-D.
     """
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))

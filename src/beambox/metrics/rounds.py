@@ -14,7 +14,7 @@ class Result(Protocol):
     """Scores of some classes."""
 
     def to_json(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return an entry a class, with its ``iou``; further entries, such as a mean, have none."""
+        """Return an entry per class, with its ``iou``; further entries, such as a mean, have none."""
         ...
 
 

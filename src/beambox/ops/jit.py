@@ -1,6 +1,6 @@
 """How CPU kernels are compiled: by numba, once, without the interpreter's lock.
 
-Kernels run on the calling thread; :func:`run_in_blocks` spreads the long ones over as many threads as PyTorch may
+Kernels run on the calling thread; :func:`parallel_for` spreads the long ones over as many threads as PyTorch may
 use. Plain threads are used rather than numba's own, whose pools may neither be entered by two threads at a time nor be
 used before a fork, and data loaders do both.
 """
@@ -16,7 +16,7 @@ from typing import Any
 import numba
 import torch
 
-__all__ = ["jit", "jit_sums", "run_in_blocks"]
+__all__ = ["jit", "jit_fastmath", "parallel_for"]
 
 
 def jit(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -27,7 +27,7 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compile(function, fastmath=False)
 
 
-def jit_sums(function: Callable[..., Any]) -> Callable[..., Any]:
+def jit_fastmath(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel as :func:`jit` does, but let it add in another order and fuse a product with its sum.
 
     For long dot products, which use the processor's vectors only so. NaN and infinity are still honoured.
@@ -46,7 +46,7 @@ PIECES = 4
 """Blocks a thread: one that another program holds up then leaves its share to the others."""
 
 
-def run_in_blocks(kernel: Callable[[int, int], None], length: int, smallest: int = 1) -> None:
+def parallel_for(kernel: Callable[[int, int], None], length: int, smallest: int = 1) -> None:
     """Run ``kernel(start, stop)`` over ``0 .. length`` in blocks, each taken by the next free thread.
 
     Blocks must be independent, so that the result does not depend on their number or order.

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from beambox import __version__
-from beambox.checks import BeamboxError, MissingFileError
+from beambox.checks import BeamboxError, MissingFileError, expect_library
 from beambox.data.custom import CustomSource
 from beambox.data.custom_config import KITTI_GROUND
 from beambox.data.once import OnceSource
@@ -19,7 +19,7 @@ from beambox.data.source import FrameSource
 from beambox.infer.benchmark import device_name
 from beambox.infer.cards import read_card
 from beambox.infer.evaluate import detect_frames, scored_frames
-from beambox.infer.predictor import Detector, View, find_weights, load
+from beambox.infer.predictor import Detector, View, load
 from beambox.infer.results import find_result, read_result
 from beambox.io import read_text, write_text
 from beambox.metrics.kitti import KittiFrame
@@ -29,6 +29,7 @@ from beambox.report.measure import Measured, PointCounts, TimedDetect, measure
 from beambox.report.page import report_html
 from beambox.report.tables import write_numbers
 from beambox.structures import Detections, Frame
+from beambox.zoo import find_weights
 
 __all__ = [
     "Options",
@@ -132,7 +133,7 @@ def about_weights(path: Path, detector: Detector) -> dict[str, Any]:
         "weights": f"{path.name}, sha256 {card.sha256}",
         "device": device_name(detector.device),
         "precision": str(detector.dtype).removeprefix("torch."),
-        "card": dict(card.said),
+        "card": dict(card.entries),
     }
     recipe = next((path.parent / name for name in RECIPE_NAMES if (path.parent / name).is_file()), None)
     if recipe is not None:
@@ -202,7 +203,8 @@ def after_evaluation(
 
 
 def check_page(out: Path) -> None:
-    """Refuse a name that is no page's, before anything is measured."""
+    """Refuse a name that is no page's, and to begin without what draws it, before anything is measured."""
+    expect_library("matplotlib", "plots", "a report")
     if out.suffix.lower() not in (".html", ".htm"):
         raise BeamboxError(f"a report is a page, so its name ends in .html; got {out}")
 
@@ -241,7 +243,7 @@ def write_page(
 def _frame_pages(out: Path, one: Measured, source: FrameSource, drawn: Sequence[Picture]) -> Mapping[str, str]:
     from urllib.parse import quote
 
-    from beambox.visualise.scene import Scene, scene_html
+    from beambox.visualize.scene import Scene, scene_html
 
     folder = out.with_name(f"{out.stem}_frames")
     links = {}

@@ -15,7 +15,7 @@ from beambox.report.measure import Measured
 
 __all__ = ["calibration_chart", "curves_chart", "error_chart", "group_chart", "score_chart"]
 
-COLOURS = ("#2f6fd0", "#e0782f")
+COLORS = ("#2f6fd0", "#e0782f")
 """Of the evaluation, and of the one it is compared with."""
 STYLES = ("-", "--", ":")
 
@@ -45,16 +45,16 @@ def _plain(text: str) -> str:
 def curves_chart(all_of: Sequence[Measured], name: str) -> bytes:
     """Draw the precision-recall curves of a class: the official interpolation at 41 recalls, else at every recall."""
     figure, axes = _figure()
-    for one, colour in zip(all_of, COLOURS):
+    for one, color in zip(all_of, COLORS):
         if isinstance(one.scored, KittiResult):
             recalls = np.linspace(0, 1, 41)
             for level, average, style in zip(one.scored.levels, one.scored[name].box3d, STYLES):
                 if average.curve:
                     label = _plain(f"{one.name}, {level}" if len(all_of) > 1 else level)
-                    axes.plot(recalls[1:], average.curve[1:], style, color=colour, label=label, linewidth=1.6)
+                    axes.plot(recalls[1:], average.curve[1:], style, color=color, label=label, linewidth=1.6)
         else:
             recall, precision = numbers.precision_recall(one.matches, name)
-            axes.step(recall, precision, where="post", color=colour, label=_plain(one.name), linewidth=1.6)
+            axes.step(recall, precision, where="post", color=color, label=_plain(one.name), linewidth=1.6)
     axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="recall", ylabel="precision, interpolated")
     return _finish(figure, axes)
 
@@ -63,7 +63,7 @@ def score_chart(all_of: Sequence[Measured], name: str) -> bytes:
     """Draw how many detections of a class have which score, the right above the wrong."""
     figure, axes = _figure()
     edges = np.linspace(0, 1, 21)
-    for k, (one, colour) in enumerate(zip(all_of, COLOURS)):
+    for k, (one, color) in enumerate(zip(all_of, COLORS)):
         found = one.matches.found
         mine = (found.name == name) & (found.kind != "ignored")
         right = np.histogram(found.score[mine & (found.kind == "right")], edges)[0]
@@ -71,8 +71,8 @@ def score_chart(all_of: Sequence[Measured], name: str) -> bytes:
         width = 0.05 / len(all_of)
         at = edges[:-1] + width * (k + 0.5)
         prefix = f"{one.name}, " if len(all_of) > 1 else ""
-        axes.bar(at, right, width * 0.9, color=colour, label=_plain(f"{prefix}right"))
-        axes.bar(at, -wrong, width * 0.9, color=colour, alpha=0.4, label=_plain(f"{prefix}wrong"))
+        axes.bar(at, right, width * 0.9, color=color, label=_plain(f"{prefix}right"))
+        axes.bar(at, -wrong, width * 0.9, color=color, alpha=0.4, label=_plain(f"{prefix}wrong"))
     axes.axhline(0, color="black", linewidth=0.6)
     axes.set(xlim=(0, 1), xlabel="score", ylabel="detections: right up, wrong down")
     axes.set_yscale("symlog", linthresh=10)
@@ -83,15 +83,15 @@ def calibration_chart(all_of: Sequence[Measured], name: str) -> bytes:
     """Draw the share of right detections over their score; on the diagonal a score is a probability."""
     figure, axes = _figure()
     axes.plot((0, 1), (0, 1), color="gray", linewidth=0.8, linestyle=":")
-    for one, colour in zip(all_of, COLOURS):
+    for one, color in zip(all_of, COLORS):
         scores = numbers.calibration(one.matches, name)
         filled = [each for each in scores.bins if each.right + each.wrong]
         share = [each.right / (each.right + each.wrong) for each in filled]
         label = f"{one.name}: error {scores.error:.1f} %" if filled else f"{one.name}: no detections"
-        axes.plot([each.mean_score for each in filled], share, "o-", color=colour, label=_plain(label), markersize=4)
+        axes.plot([each.mean_score for each in filled], share, "o-", color=color, label=_plain(label), markersize=4)
         for each, height in zip(filled, share):
             axes.annotate(
-                str(each.right + each.wrong), (each.mean_score, height), fontsize=6, color=colour,
+                str(each.right + each.wrong), (each.mean_score, height), fontsize=6, color=color,
                 xytext=(3, -8), textcoords="offset points",
             )  # fmt: skip
     axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="mean score", ylabel="share that is right")
@@ -107,7 +107,7 @@ def group_chart(all_of: Sequence[Measured], name: str) -> bytes:
             label = group.name if group.by != "points" else f"{group.name} pts"
             if label not in labels and group.objects:
                 labels.append(label)
-    for k, (one, colour) in enumerate(zip(all_of, COLOURS)):
+    for k, (one, color) in enumerate(zip(all_of, COLORS)):
         values = {
             g.name if g.by != "points" else f"{g.name} pts": g.ap
             for g in numbers.groups(one.matches, name)
@@ -116,7 +116,7 @@ def group_chart(all_of: Sequence[Measured], name: str) -> bytes:
         width = 0.8 / len(all_of)
         at = np.arange(len(labels)) + width * (k - (len(all_of) - 1) / 2)
         heights = [0 if math.isnan(values.get(label, math.nan)) else values[label] for label in labels]
-        bars = axes.bar(at, heights, width * 0.92, color=colour, label=_plain(one.name))
+        bars = axes.bar(at, heights, width * 0.92, color=color, label=_plain(one.name))
         axes.bar_label(bars, [f"{value:.0f}" for value in heights], fontsize=7)
     axes.set_xticks(range(len(labels)), labels, rotation=25, ha="right", fontsize=7)
     axes.set(ylim=(0, 108), ylabel="AP over every recall, %")
@@ -128,12 +128,12 @@ def error_chart(all_of: Sequence[Measured], name: str) -> bytes:
     columns = ("x", "y", "z", "range", "along", "across", "length", "width", "height")
     figure, axes = _figure(9.4, 3.2)
     axes.axhline(0, color="black", linewidth=0.6)
-    for k, (one, colour) in enumerate(zip(all_of, COLOURS)):
+    for k, (one, color) in enumerate(zip(all_of, COLORS)):
         band = one.errors[name]["overall"]
         at = np.arange(len(columns) + 1) + 0.18 * (k - (len(all_of) - 1) / 2)
         mean = [100 * band.mean[c] for c in columns] + [math.degrees(band.mean["heading"])]
         spread = [100 * band.spread[c] for c in columns] + [math.degrees(band.spread["heading"])]
-        axes.errorbar(at, mean, spread, fmt="o", color=colour, capsize=3, markersize=4, label=_plain(one.name))
+        axes.errorbar(at, mean, spread, fmt="o", color=color, capsize=3, markersize=4, label=_plain(one.name))
     axes.set_xticks(range(len(columns) + 1), [*columns, "heading"])
     axes.set(ylabel="detected - labelled: cm, heading degrees")
     return _finish(figure, axes)

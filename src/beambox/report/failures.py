@@ -16,8 +16,8 @@ from beambox.report import numbers
 from beambox.report.matching import Matches
 from beambox.report.measure import Measured
 from beambox.structures import Detections, Frame, Labels
-from beambox.visualise.bev import PANEL_WIDTH, Region, draw_bev
-from beambox.visualise.image import draw_camera, open_image
+from beambox.visualize.bev import PANEL_WIDTH, Region, draw_bev
+from beambox.visualize.image import draw_camera, open_image
 
 __all__ = ["HEADINGS", "Failure", "Picture", "draw_failures", "worst"]
 

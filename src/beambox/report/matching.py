@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beambox.metrics.box_errors import countable, greedy_pairs
-from beambox.metrics.kitti import LEVELS, NEIGHBOUR, KittiFrame
+from beambox.metrics.kitti import LEVELS, NEIGHBOR, KittiFrame
 from beambox.metrics.kitti_objects import objects_from_detections
 from beambox.metrics.overlap import covered_share, rotated_overlaps
 
@@ -138,15 +138,15 @@ def _match_frame(
         rows, columns = np.flatnonzero(truth_names == key), np.flatnonzero(found_names == key)
         columns = columns[np.argsort(-scores[columns], kind="stable")]
         own3d, own_near = box3d[np.ix_(rows, columns)], near[np.ix_(rows, columns)]
-        neighbours = np.flatnonzero(truth_names == NEIGHBOUR.get(key, ""))
-        others = np.flatnonzero((truth_names != key) & (truth_names != NEIGHBOUR.get(key, "")))
+        neighbors = np.flatnonzero(truth_names == NEIGHBOR.get(key, ""))
+        others = np.flatnonzero((truth_names != key) & (truth_names != NEIGHBOR.get(key, "")))
         partner = {column: row for row, column in greedy_pairs(own3d, thresholds[name])}
         for place, column in enumerate(columns):
             if place in partner:
                 row = rows[partner[place]]
                 score_of[row] = scores[column]
                 kinds[column] = "right" if counts[row] else "ignored"
-            elif spared[column] or (box3d[neighbours, column] > thresholds[name]).any():
+            elif spared[column] or (box3d[neighbors, column] > thresholds[name]).any():
                 kinds[column] = "ignored"
             elif (own3d[:, place] > thresholds[name]).any():
                 kinds[column] = "duplicate"
@@ -158,8 +158,10 @@ def _match_frame(
     occlusion = np.full(len(truth), -1) if labels.attributes is None else labels.attributes.occlusion.long().numpy()
     for row, key in enumerate(truth_names):
         if key in known:
-            held = -1 if points is None else int(points[row])
-            truths.append((number, row, known[key], counts[row], distance[0][row], occlusion[row], held, score_of[row]))
+            num_points = -1 if points is None else int(points[row])
+            truths.append(
+                (number, row, known[key], counts[row], distance[0][row], occlusion[row], num_points, score_of[row])
+            )
     for column, key in enumerate(found_names):
         if key in known:
             mine = box3d[truth_names == key, column]

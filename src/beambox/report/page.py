@@ -14,7 +14,7 @@ from beambox.report import charts, numbers
 from beambox.report.failures import HEADINGS, Picture
 from beambox.report.measure import Measured
 from beambox.report.tables import ap_rows
-from beambox.visualise.page import data_url, fill
+from beambox.visualize.page import data_url, fill
 
 __all__ = ["report_html"]
 
@@ -217,12 +217,12 @@ def _errors(prefix: str, errors: BoxErrors, name: str) -> str:
             cells.append("-" if math.isnan(mean) else f"{mean:+.1f} ± {spread:.1f}")
         rows.append([band.name, f"{band.matched}/{band.objects}", *cells])
     head = [prefix or "distance", "found", *(f"{c} {'°' if c == 'heading' else 'cm'}" for c in COLUMNS)]
-    told = [
+    remarks = [
         f"{key} {'-' if math.isnan(v) else f'{v:.3f}'}"
         for key, v in (("ATE", mine.ate), ("ASE", mine.ase), ("AOE", mine.aoe))
     ]
     flipped = "-" if math.isnan(mine.flipped) else f"{mine.flipped:.1f}"
-    return _table(head, rows) + f"<p>{', '.join(told)}; {flipped} % point the other way</p>"
+    return _table(head, rows) + f"<p>{', '.join(remarks)}; {flipped} % point the other way</p>"
 
 
 def _pictures(pictures: Sequence[Picture], links: Mapping[str, str]) -> list[str]:

@@ -17,21 +17,21 @@ PARTLY, LARGELY, UNKNOWN = 0.15, 0.50, 0.92
 """Shares of an object's beams lost to others from which it is partly or largely occluded, or hard to tell."""
 
 
-def occlusion_level(alone: np.ndarray, got: np.ndarray) -> np.ndarray:
+def occlusion_level(unoccluded_hits: np.ndarray, hits: np.ndarray) -> np.ndarray:
     """KITTI's occlusion of each object: 0 visible, 1 partly, 2 largely occluded, 3 unknown.
 
     Args:
-        alone: ``(O,)`` beams that would meet the object were nothing else there.
-        got: ``(O,)`` beams that do.
+        unoccluded_hits: ``(O,)`` beams that would meet the object were nothing else there.
+        hits: ``(O,)`` beams that do.
     """
-    lost = 1.0 - got / np.maximum(alone, 1)
+    lost = 1.0 - hits / np.maximum(unoccluded_hits, 1)
     return (lost >= PARTLY).astype(np.int64) + (lost >= LARGELY) + (lost >= UNKNOWN)
 
 
 def annotate(
     placed: Sequence[Placed],
-    alone: np.ndarray,
-    got: np.ndarray,
+    unoccluded_hits: np.ndarray,
+    hits: np.ndarray,
     calibration: Calibration,
     image_size: tuple[int, int],
     full: bool,
@@ -40,7 +40,7 @@ def annotate(
 
     With ``full``, an object that the image does not show gets truncation 1 and the image box 0, 0, 0, 0.
     """
-    chosen = [i for i, p in enumerate(placed) if p.name and got[i] > 0]
+    chosen = [i for i, p in enumerate(placed) if p.name and hits[i] > 0]
     boxes = torch.tensor([placed[i].box for i in chosen], dtype=torch.float64).reshape(-1, 7)
     names = tuple(placed[i].name for i in chosen)
     wide, clipped = calibration.to_camera(boxes), calibration.to_camera(boxes, image_size)
@@ -50,6 +50,6 @@ def annotate(
     shown = (wide.location[:, 2] > 0.5) & (inside.prod(dim=1) > 4) & (truncation < 0.95)
     image = torch.where(shown[:, None], clipped.image, torch.zeros(4, dtype=torch.float64))
     truncation = torch.where(shown, truncation, torch.ones_like(truncation))
-    occlusion = torch.from_numpy(occlusion_level(alone[chosen], got[chosen])).reshape(-1)
+    occlusion = torch.from_numpy(occlusion_level(unoccluded_hits[chosen], hits[chosen])).reshape(-1)
     labels = Labels(boxes.float(), names, ImageAttributes(truncation, occlusion, clipped.alpha, image))
     return labels if full else labels[shown]

@@ -13,8 +13,8 @@ from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.kitti import DEFAULT_IMAGE_SIZE
 from beambox.geometry.calibration import Calibration
 from beambox.simulate.annotate import annotate
-from beambox.simulate.fleets import KITTI_FLEET, Fleet
 from beambox.simulate.layouts import check_layout, pick_layout, scene
+from beambox.simulate.object_mix import KITTI_MIX, ObjectMix
 from beambox.simulate.raycast import cast, pack
 from beambox.simulate.returns import measure
 from beambox.simulate.sensors import Sensor, load_sensor
@@ -55,7 +55,7 @@ def simulate_frame(
     view: str = "camera",
     layout: str = "random",
     layout_split: str | None = "train",
-    fleet: Fleet = KITTI_FLEET,
+    object_mix: ObjectMix = KITTI_MIX,
 ) -> Frame:
     """Simulate one sweep; the same arguments give the same frame.
 
@@ -66,7 +66,7 @@ def simulate_frame(
         view: ``camera`` casts and keeps only what the camera sees; ``full`` the whole turn.
         layout: ``random``, ``kitti:PATH`` (folder or archive of label_2 and calib) or ``mixed:PATH`` (in turn).
         layout_split: which ImageSets list of the layouts to draw from, where there is one; None draws from all.
-        fleet: which objects random streets hold, and how labels call them.
+        object_mix: which objects random streets hold, and how labels call them.
 
     Returns:
         Frame with points, labels (with attributes), calibration and image size.
@@ -83,12 +83,12 @@ def simulate_frame(
     full = view == "full"
     real = pick_layout(path, layout_split, rng) if kind == "kitti" or (kind == "mixed" and index % 2) else None
     calibration = real.calibration if real else CAMERA
-    stage = scene(rng, sensor.height, full, real, fleet)
-    points, alone, got = _sweep(stage, sensor, full, rng)
+    stage = scene(rng, sensor.height, full, real, object_mix)
+    points, unoccluded_hits, hits = _sweep(stage, sensor, full, rng)
     frame = Frame(
         points=torch.from_numpy(points),
         id=f"{index:06d}",
-        labels=fleet.rename(annotate(stage.placed, alone, got, calibration, DEFAULT_IMAGE_SIZE, full)),
+        labels=object_mix.rename(annotate(stage.placed, unoccluded_hits, hits, calibration, DEFAULT_IMAGE_SIZE, full)),
         calibration=calibration,
         image_size=DEFAULT_IMAGE_SIZE,
         notes=(f"layout {real.id if real else 'random'}",),
@@ -120,7 +120,7 @@ def _sweep(stage, sensor: Sensor, full: bool, rng: np.random.Generator):
     up = np.broadcast_to(np.sin(elevation)[:, None], angle.shape)
     directions = np.stack((flat * np.cos(angle), flat * np.sin(angle), up), axis=2).reshape(-1, 3)  # (B * C, 3)
     points = measure(hits, np.repeat(offsets, len(azimuths)), directions, table, sensor, rng)
-    return points, hits.alone, hits.got
+    return points, hits.unoccluded_hits, hits.hits
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ import numpy as np
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.data.kitti import parse_calibration, parse_labels
 from beambox.geometry.calibration import Calibration
-from beambox.simulate.fleets import KITTI_FLEET, SIZES, Fleet
 from beambox.simulate.ground import Ground, Road
 from beambox.simulate.materials import Palette
+from beambox.simulate.object_mix import KITTI_MIX, SIZES, ObjectMix
 from beambox.simulate.stage import Stage
-from beambox.simulate.streets import dress, random_ground, random_street
+from beambox.simulate.streets import add_scenery, random_ground, random_street
 from beambox.structures.labels import Labels
 
 __all__ = ["KittiLayout", "check_layout", "layout_frames", "scene"]
@@ -116,7 +116,7 @@ def pick_layout(path: str, split: str | None, rng: np.random.Generator) -> Kitti
 
 
 def scene(
-    rng: np.random.Generator, height: float, full: bool, layout: KittiLayout | None, fleet: Fleet = KITTI_FLEET
+    rng: np.random.Generator, height: float, full: bool, layout: KittiLayout | None, object_mix: ObjectMix = KITTI_MIX
 ) -> Stage:
     """Build a scene: a random street, or the objects of a KITTI frame amid made-up scenery.
 
@@ -125,13 +125,13 @@ def scene(
         height: of the sensor, metres.
         full: whether things stand behind the sensor too.
         layout: the objects; None for a random street.
-        fleet: which objects a random street holds.
+        object_mix: which objects a random street holds.
     """
     palette = Palette(rng)
     ahead = -_BEHIND if full else 0.0
     if layout is None:
         roads = _random_roads(rng)
-        stage = Stage(random_ground(roads, rng, height), palette, rng, ahead, fleet=fleet)
+        stage = Stage(random_ground(roads, rng, height), palette, rng, ahead, object_mix=object_mix)
         random_street(stage, roads)
         return stage
     boxes = layout.labels.boxes.numpy().astype(np.float64)
@@ -140,7 +140,7 @@ def scene(
     for name, box in zip(layout.labels.names, boxes):
         if name in SIZES and (box[3:6] > 0.2).all() and math.hypot(box[0], box[1]) < 85:
             stage.add_object(name, box[0], box[1], box[6], tuple(box[3:6]), box[2] - box[5] / 2, force=True)
-    dress(stage, road)
+    add_scenery(stage, road)
     return stage
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["AIR", "BARK", "DARK", "GLASS", "INSIDE", "LEAVES", "LIGHT", "METAL", "PANE", "RETRO", "RIM", "SKIN", "TYRE",
+__all__ = ["AIR", "BARK", "DARK", "GLASS", "INSIDE", "LEAVES", "LIGHT", "METAL", "PANE", "RETRO", "RIM", "SKIN", "TIRE",
            "Palette"]  # fmt: skip
 
 # Fixed rows of every palette; the first four are the ground's surfaces in the order of ground.ROAD ... MARKING.
-AIR, GLASS, PANE, DARK, TYRE, RIM, RETRO, LIGHT, LEAVES, BARK, METAL, SKIN, INSIDE = range(4, 17)
+AIR, GLASS, PANE, DARK, TIRE, RIM, RETRO, LIGHT, LEAVES, BARK, METAL, SKIN, INSIDE = range(4, 17)
 
 
 class Palette:

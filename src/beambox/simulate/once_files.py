@@ -11,8 +11,8 @@ from beambox.checks import BeamboxError
 from beambox.data.once import write_once_sequence, write_once_split
 from beambox.geometry.axes import Axes, turn_boxes
 from beambox.io import read_json
-from beambox.simulate.fleets import ONCE_FLEET
 from beambox.simulate.frames import simulate_frame
+from beambox.simulate.object_mix import ONCE_MIX
 from beambox.structures.frame import Frame
 from beambox.structures.labels import Labels
 
@@ -70,7 +70,7 @@ class OnceFiles:
 
     def write(self, task: range) -> int:
         """Simulate and write one sequence."""
-        frames = (in_once_axes(simulate_frame(self.seed, i, fleet=ONCE_FLEET, **self.options)) for i in task)
+        frames = (in_once_axes(simulate_frame(self.seed, i, object_mix=ONCE_MIX, **self.options)) for i in task)
         return write_once_sequence(self.out, f"{task.start // self.length:06d}", frames, _calibrations())
 
     def write_splits(self) -> None:

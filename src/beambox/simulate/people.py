@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from beambox.simulate.materials import METAL, SKIN, TYRE, Palette
+from beambox.simulate.materials import METAL, SKIN, TIRE, Palette
 from beambox.simulate.shapes import Shape, rotation
 
 __all__ = ["cyclist", "pedestrian", "sitting"]
@@ -25,7 +25,7 @@ def pedestrian(size: tuple[float, float, float], palette: Palette, rng: np.rando
         knee = (0.5 * foot[0] + 0.04, side * 0.1, 0.27 * h)
         shape.limb(hip, knee, 0.075, trousers)
         shape.limb(knee, foot, 0.055, trousers)
-        shape.ellipsoid((foot[0] + 0.06, foot[1], 0.04), (0.13, 0.05, 0.045), TYRE)
+        shape.ellipsoid((foot[0] + 0.06, foot[1], 0.04), (0.13, 0.05, 0.045), TIRE)
         elbow = (-side * stride * 0.4, side * shoulder, 0.62 * h)
         shape.limb((0.0, side * shoulder * 0.85, 0.81 * h), elbow, 0.05, top)
         shape.limb(elbow, (-side * stride * 0.7 + 0.08, side * shoulder * 0.95, 0.47 * h), 0.04, top)
@@ -65,12 +65,12 @@ def cyclist(size: tuple[float, float, float], palette: Palette, rng: np.random.G
     axle = hx - wheel
     for x in (axle, -axle):
         turn = rotation(rng.uniform(-0.2, 0.2) if x > 0 else 0.0)
-        shape.ellipsoid((x, 0.0, wheel), (wheel, 0.02, wheel), TYRE, turn, density=5.0)
+        shape.ellipsoid((x, 0.0, wheel), (wheel, 0.02, wheel), TIRE, turn, density=5.0)
         for k in range(8):
             a, b = math.tau * k / 8, math.tau * (k + 1) / 8
             rim = wheel - 0.02
             start = (x + rim * math.cos(a), 0.0, wheel + rim * math.sin(a))
-            shape.limb(start, (x + rim * math.cos(b), 0.0, wheel + rim * math.sin(b)), 0.018, TYRE)
+            shape.limb(start, (x + rim * math.cos(b), 0.0, wheel + rim * math.sin(b)), 0.018, TIRE)
     bar, saddle, crank = (axle * 0.72, 0.0, 0.58 * h), (-axle * 0.4, 0.0, 0.53 * h), (-0.02, 0.0, 0.29)
     for start, end in (((axle, 0.0, wheel), bar), (bar, crank), (crank, saddle), (saddle, (-axle, 0.0, wheel)),
                        (saddle, bar)):  # fmt: skip

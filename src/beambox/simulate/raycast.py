@@ -54,9 +54,9 @@ class Hits:
     """Row of the palette."""
     cosine: np.ndarray
     """Cosine of the incidence."""
-    alone: np.ndarray
+    unoccluded_hits: np.ndarray
     """(O,) beams that would meet the object were it alone over the ground."""
-    got: np.ndarray
+    hits: np.ndarray
     """(O,) beams that do meet it."""
 
 
@@ -137,8 +137,8 @@ def _bounds(placed: Sequence[Placed], shift: np.ndarray, origins: tuple[float, f
     close = np.maximum(near, 0.05)
     tan_low = np.where(bottom < 0, bottom / close, bottom / far)
     tan_high = np.where(top > 0, top / close, top / far)
-    labelled = np.array([float(bool(p.name)) for p in placed])
-    return np.stack((middle + (lo + hi) / 2, half, tan_low, tan_high, near, labelled), axis=1)
+    labeled = np.array([float(bool(p.name)) for p in placed])
+    return np.stack((middle + (lo + hi) / 2, half, tan_low, tan_high, near, labeled), axis=1)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -304,7 +304,7 @@ def _patched(patches: np.ndarray, first: int, last: int, pose: np.ndarray, x: fl
 @numba.njit(cache=True, nogil=True)
 def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out) -> None:
     planes, plane_material, ellipsoids, parts, part_start, patches, patch_start, poses, reaches, bounds = packed
-    distance, owner, material, cosine, alone, got = out
+    distance, owner, material, cosine, unoccluded_hits, hits = out
     start, index = _columns(bounds, azimuths, step)
     for b in range(len(beams)):
         ce, se, oz = math.cos(beams[b, 0]), math.sin(beams[b, 0]), beams[b, 1]
@@ -328,8 +328,8 @@ def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out
                 o = index[k]
                 if tangent < bounds[o, 2] or tangent > bounds[o, 3]:
                     continue
-                labelled = bounds[o, 5] > 0.5
-                if bounds[o, 4] > best * 1.001 and not labelled:
+                labeled = bounds[o, 5] > 0.5
+                if bounds[o, 4] > best * 1.001 and not labeled:
                     continue
                 if _misses(poses[o], reaches[o], oz, dx, dy, se):
                     continue
@@ -341,7 +341,7 @@ def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out
                     if t < mine:
                         mine, my_material, my_cos = t, m, cosine_here
                 if mine < floor and mine < limit:
-                    alone[o] += 1
+                    unoccluded_hits[o] += 1
                 if mine < best:
                     best, who, what, cos = mine, o, my_material, my_cos
             if who >= 0 and patch_start[who + 1] > patch_start[who]:
@@ -349,7 +349,7 @@ def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out
                                  oz + se * best)  # fmt: skip
                 what = other if other >= 0 else what
             if who >= 0 and best < limit:
-                got[who] += 1
+                hits[who] += 1
             distance[beam], owner[beam], material[beam], cosine[beam] = best, who, what, cos
 
 
@@ -389,8 +389,8 @@ def cast(
     count, objects = len(beams) * len(azimuths), len(packed[-1])
     distance, owner = np.empty(count), np.empty(count, np.int64)
     material, cosine = np.empty(count, np.int64), np.empty(count)
-    alone, got = np.zeros(objects, np.int64), np.zeros(objects, np.int64)
-    out = (distance, owner, material, cosine, alone, got)
+    unoccluded_hits, hits = np.zeros(objects, np.int64), np.zeros(objects, np.int64)
+    out = (distance, owner, material, cosine, unoccluded_hits, hits)
     _cast(packed, ground, table, np.uint64(seed), azimuths, phases, beams, limit, step, out)
     distance[(distance >= limit) | (owner == -2)] = np.inf
     return Hits(*out)

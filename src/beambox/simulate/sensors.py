@@ -45,13 +45,13 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if not self.elevations:
-            raise BeamboxError("`elevations` must hold one angle a beam in degrees, got none")
+            raise BeamboxError("`elevations` must hold one angle per beam in degrees, got none")
         if any(not -90 < e < 90 for e in self.elevations):
             raise BeamboxError(f"`elevations` must lie between -90 and 90 degrees, got {min(self.elevations)} to "
                                f"{max(self.elevations)}")  # fmt: skip
         if self.offsets and len(self.offsets) != len(self.elevations):
             raise BeamboxError(
-                f"`offsets` must be empty or one a beam ({len(self.elevations)}), got {len(self.offsets)}"
+                f"`offsets` must be empty or one per beam ({len(self.elevations)}), got {len(self.offsets)}"
             )
         for name in ("azimuth_step", "height", "max_range", "sensitivity", "intensity_step"):
             value = {f.name: value for f, value in zip(fields(self), self._values())}[name]

@@ -27,8 +27,8 @@ class Shape:
         for k in range(3):
             self.low[k] = min(self.low[k], low[k])
             self.high[k] = max(self.high[k], high[k])
-        centre = [(a + b) / 2 for a, b in zip(low, high)]
-        return centre[0], centre[1], centre[2], math.dist(low, high) / 2
+        center = [(a + b) / 2 for a, b in zip(low, high)]
+        return center[0], center[1], center[2], math.dist(low, high) / 2
 
     def convex(self, planes: Sequence[Plane], low: Vector, high: Vector, density: float = 0.0) -> None:
         """Add the common inside of half-spaces, which must lie between the corners ``low`` and ``high``.
@@ -65,16 +65,16 @@ class Shape:
 
     def wheel(self, x: float, y: float, radius: float, width: float, materials: tuple[int, int]) -> None:
         """Add a wheel that stands on the ground; materials of tyre and rim."""
-        tyre, rim = materials
+        tire, rim = materials
         planes: list[Plane] = [(0.0, 1.0, 0.0, y + width / 2, rim), (0.0, -1.0, 0.0, width / 2 - y, rim)]
         for k in range(10):
             c, s = math.cos(2 * math.pi * k / 10), math.sin(2 * math.pi * k / 10)
-            planes.append((c, 0.0, s, radius * 0.98 + c * x + s * radius, tyre))
+            planes.append((c, 0.0, s, radius * 0.98 + c * x + s * radius, tire))
         self.convex(planes, (x - radius, y - width / 2, 0.0), (x + radius, y + width / 2, 2 * radius))
 
     def ellipsoid(
         self,
-        centre: Vector,
+        center: Vector,
         radii: Vector,
         material: int,
         turn: Sequence[Sequence[float]] | None = None,
@@ -84,11 +84,11 @@ class Shape:
         axes = turn or ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         matrix = [axes[j][i] / radii[i] for i in range(3) for j in range(3)]
         reach = [math.sqrt(sum((axes[j][i] * radii[i]) ** 2 for i in range(3))) for j in range(3)]
-        low, high = ([c + k * r for c, r in zip(centre, reach)] for k in (-1, 1))
+        low, high = ([c + k * r for c, r in zip(center, reach)] for k in (-1, 1))
         self._reach(low, high)
         index = len(self.ellipsoids)
         self.ellipsoids.append(tuple(matrix))
-        self.parts.append((1.0, index, index + 1, *centre, max(radii), density, material))
+        self.parts.append((1.0, index, index + 1, *center, max(radii), density, material))
 
     def limb(self, start: Vector, end: Vector, radius: float, material: int) -> None:
         """Add a slender ellipsoid from one joint to another."""
@@ -104,8 +104,8 @@ class Shape:
         norm = math.hypot(*u)
         u = [v / norm for v in u]
         v = [w[1] * u[2] - w[2] * u[1], w[2] * u[0] - w[0] * u[2], w[0] * u[1] - w[1] * u[0]]
-        centre = tuple((a + b) / 2 for a, b in zip(start, end))
-        self.ellipsoid(centre, (radius, radius, length / 2 + radius), material, list(zip(u, v, w)))  # type: ignore[arg-type]
+        center = tuple((a + b) / 2 for a, b in zip(start, end))
+        self.ellipsoid(center, (radius, radius, length / 2 + radius), material, list(zip(u, v, w)))  # type: ignore[arg-type]
 
     def move_forward(self, distance: float) -> None:
         """Shift everything added so far along x, metres."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beambox.simulate import people, vehicles
-from beambox.simulate.fleets import KITTI_FLEET, Fleet, draw_size
 from beambox.simulate.ground import Ground, ground_height
 from beambox.simulate.materials import Palette
+from beambox.simulate.object_mix import KITTI_MIX, ObjectMix, draw_size
 from beambox.simulate.raycast import Placed
 from beambox.simulate.shapes import Shape, rotation
 
@@ -67,7 +67,7 @@ class Stage:
     """How far behind the sensor things are put, as a negative x in metres; 0 for the camera's view."""
     guard: bool = False
     """Whether scenery must not hide objects."""
-    fleet: Fleet = KITTI_FLEET
+    object_mix: ObjectMix = KITTI_MIX
     """Which objects there are."""
     placed: list[Placed] = field(default_factory=list)
     """Everything so far."""
@@ -99,7 +99,7 @@ class Stage:
         """Put an object of a kind where nothing stands; returns whether it fitted.
 
         Args:
-            name: a kind, a key of the fleet's ``sizes``.
+            name: a kind, a key of the object mix's ``sizes``.
             x: metres.
             y: metres.
             yaw: heading, radians.
@@ -107,7 +107,7 @@ class Stage:
             bottom: z of the label's bottom; where absent the object stands on the ground.
             force: put it even where it overlaps another.
         """
-        size = size or draw_size(name, self.rng, self.fleet.sizes)
+        size = size or draw_size(name, self.rng, self.object_mix.sizes)
         if not force and not (self.sees(x, y) and self.free(x, y, size[0], size[1], yaw)):
             return False
         z, along, across = self.ground.tilt(self.packed_ground, x, y, yaw, size[0], size[1])

@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from beambox.simulate import scenery
-from beambox.simulate.fleets import draw_size
 from beambox.simulate.ground import Ground, Road
+from beambox.simulate.object_mix import draw_size
 from beambox.simulate.stage import Stage
 
-__all__ = ["dress", "random_ground", "random_street"]
+__all__ = ["add_scenery", "random_ground", "random_street"]
 
 _REACH = 78.0  # metres; nothing is put farther away
 
@@ -62,8 +62,8 @@ def _parked(stage: Stage, line: _Line, side: float, fill: float, across: bool) -
     u = stage.ahead + rng.uniform(-4, 6)
     inset = rng.uniform(0.1, 0.5) if rng.random() < 0.75 else -rng.uniform(0.2, 1.2)
     while u < _REACH:
-        name = str(rng.choice(stage.fleet.parked))
-        size = draw_size(name, rng, stage.fleet.sizes)
+        name = str(rng.choice(stage.object_mix.parked))
+        size = draw_size(name, rng, stage.object_mix.sizes)
         along = size[1] if across else size[0]
         u += along / 2
         if rng.random() < fill:
@@ -77,7 +77,7 @@ def _parked(stage: Stage, line: _Line, side: float, fill: float, across: bool) -
 
 def _traffic(stage: Stage, line: _Line, density: float) -> None:
     rng, road = stage.rng, line.road
-    kinds, shares = list(stage.fleet.traffic), list(stage.fleet.traffic.values())
+    kinds, shares = list(stage.object_mix.traffic), list(stage.object_mix.traffic.values())
     lanes = max(1, int(road.half_width / 3.0))
     for side in (1.0, -1.0):
         for lane in range(lanes):
@@ -98,13 +98,13 @@ def _people(stage: Stage, line: _Line, count: int) -> None:
         side = 1.0 if rng.random() < 0.5 else -1.0
         u = rng.uniform(4, 50) if stage.ahead == 0 or rng.random() < 0.6 else rng.uniform(stage.ahead / 2, 4)
         kind = rng.random()
-        if kind < stage.fleet.walking:
+        if kind < stage.object_mix.walking:
             s = side * (road.half_width + rng.uniform(-1.0, max(road.pavement, 1.0)))
             x, y, direction = line.at(u, s)
             turn = direction + (0.0 if rng.random() < 0.5 else math.pi) + rng.normal(0, 0.5)
             for k in range(rng.integers(1, 4)):
                 stage.add_object("Pedestrian", x + 0.1 * k, y + 0.75 * k, turn + rng.normal(0, 0.2))
-        elif kind < stage.fleet.riding:
+        elif kind < stage.object_mix.riding:
             x, y, direction = line.at(u, side * (road.half_width + rng.uniform(-2.0, 1.5)))
             stage.add_object("Cyclist", x, y, direction + (0.0 if side < 0 else math.pi) + rng.normal(0, 0.15))
         else:
@@ -124,17 +124,17 @@ def random_street(stage: Stage, roads: tuple[Road, ...]) -> None:
             if kind < 0.62:
                 _parked(stage, line, side, rng.uniform(0.15, 1.0), across=rng.random() < 0.22)
         if rng.random() < 0.65:
-            _people(stage, line, int(rng.integers(*stage.fleet.people)))
+            _people(stage, line, int(rng.integers(*stage.object_mix.people)))
     for _ in range(rng.integers(0, 6)):  # drives, yards, crossings: any heading
         x, y = rng.uniform(8, 60), rng.uniform(-25, 25)
         x = -x if stage.ahead < 0 and rng.random() < 0.5 else x
-        name = str(rng.choice(stage.fleet.strays))
+        name = str(rng.choice(stage.object_mix.strays))
         stage.add_object(name, x, y, rng.uniform(-math.pi, math.pi))
     for road in roads:
-        dress(stage, road)
+        add_scenery(stage, road)
 
 
-def dress(stage: Stage, road: Road) -> None:
+def add_scenery(stage: Stage, road: Road) -> None:
     """Put scenery on both sides of a road: verge, fronts, and what stands behind."""
     rng = stage.rng
     line = _Line(road)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beambox.simulate.materials import AIR, DARK, GLASS, INSIDE, LIGHT, PANE, RETRO, RIM, TYRE, Palette
+from beambox.simulate.materials import AIR, DARK, GLASS, INSIDE, LIGHT, PANE, RETRO, RIM, TIRE, Palette
 from beambox.simulate.shapes import Plane, Shape, profile_planes
 
 __all__ = ["CAR_STYLES", "bus", "car", "trailer", "tram", "truck", "van"]
@@ -107,7 +107,7 @@ def _side(y0: float, z0: float, y1: float, z1: float, material: int) -> list[Pla
 def _wheels(shape: Shape, axles: tuple[float, ...], hy: float, radius: float, width: float = 0.2) -> None:
     for x in axles:
         for side in (1.0, -1.0):
-            shape.wheel(x, side * (hy - width / 2 - 0.01), radius, width, (TYRE, RIM))
+            shape.wheel(x, side * (hy - width / 2 - 0.01), radius, width, (TIRE, RIM))
 
 
 def _lamps(shape: Shape, hx: float, hy: float, h: float, rng: np.random.Generator, rear_height: float) -> None:

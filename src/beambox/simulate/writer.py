@@ -87,7 +87,7 @@ def write_dataset(
     check_layout(layout)
     options = {"sensor": sensor, "view": view, "layout": layout, "layout_split": layout_split}
     card = {"files": files, "seed": seed, "val_share": val_share, "sequence_length": sequence_length if once else None}
-    _claim(out, {**card, **options, "sensor": json.loads(json.dumps(asdict(sensor)))})
+    _reserve(out, {**card, **options, "sensor": json.loads(json.dumps(asdict(sensor)))})
     layer = (
         OnceFiles(str(out), seed, options, val_share, sequence_length)
         if once
@@ -140,7 +140,7 @@ class KittiFiles:
         write_split(self.out, "val", [n for n in names if n in val])
 
 
-def _claim(out: Path, card: dict) -> None:
+def _reserve(out: Path, card: dict) -> None:
     """Record what the folder is made with, or refuse where it holds something else."""
     path = out / _CARD
     if path.exists():

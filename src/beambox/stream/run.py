@@ -45,11 +45,11 @@ class Report:
     def text(self) -> str:
         """Say it in a line."""
         wall = time.perf_counter() - self.started
-        told = f"{self.done} sweeps in {wall:.1f} s, {self.dropped} dropped, {len(self.unreadable)} unreadable"
+        details = f"{self.done} sweeps in {wall:.1f} s, {self.dropped} dropped, {len(self.unreadable)} unreadable"
         if self.seconds:
             middle, high, most = np.percentile(self.seconds, (50, 95, 100)) * 1000
-            told += f"; latency {middle:.0f} ms median, {high:.0f} ms 95 %, {most:.0f} ms at most"
-        return told
+            details += f"; latency {middle:.0f} ms median, {high:.0f} ms 95 %, {most:.0f} ms at most"
+        return details
 
 
 def run_stream(
@@ -58,7 +58,7 @@ def run_stream(
     tracker: Tracker | None,
     write: Write,
     *,
-    min_score: float = 0.0,
+    score_threshold: float = 0.0,
     notice: Callable[[str], None] = lambda text: None,
 ) -> Report:
     """Go through sweeps as they come; one that cannot be read is left out and counted.
@@ -68,7 +68,7 @@ def run_stream(
         detect: frame -> detections in its own frame.
         tracker: gives identities; None writes detections as they are.
         write: takes each sweep with its objects.
-        min_score: leave out lower detections.
+        score_threshold: leave out lower detections.
         notice: told about sweeps that cannot be read, and of gaps.
 
     Returns:
@@ -84,7 +84,7 @@ def run_stream(
             report.unreadable.append(sweep.name)
             notice(f"left out: {error}")
             continue
-        found = found[found.scores >= min_score]
+        found = found[found.scores >= score_threshold]
         if tracker is None:
             tracks = untracked(found, sweep.stamp / 1e9)
         else:

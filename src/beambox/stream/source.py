@@ -11,7 +11,7 @@ from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.formats.columns import decode, library
 from beambox.data.formats.point_cloud2 import cloud_columns
 from beambox.data.formats.recording import recording_of
-from beambox.data.reading import frame_from_columns
+from beambox.data.read_points import frame_from_columns
 from beambox.infer.inputs import find_sweeps, read_sweep
 from beambox.structures import Frame
 
@@ -57,7 +57,7 @@ def arrivals(
         path: the recording, or recording/topic; or a folder of sweeps.
         topic: of the point clouds, where the recording has several.
         rate: sweeps per second of a folder, whose files have no time.
-        fields: names of columns, see :func:`beambox.data.reading.read_frame`.
+        fields: names of columns, see :func:`beambox.data.read_points.read_frame`.
         intensity_scale: factor for the intensity.
 
     Raises:
@@ -104,8 +104,8 @@ def _choose(root: Path, topic: str, connections: list[Any]) -> list[Any]:
     topics = sorted({one.topic.strip("/") for one in clouds})
     if not topics:
         packets = [one for one in connections if one.msgtype in PACKETS]
-        told = f"; {packets[0].topic} holds {PACKETS[packets[0].msgtype]}" if packets else ""
-        raise BeamboxError(f"{root} holds no point cloud (no message of type {POINT_CLOUD}){told}")
+        details = f"; {packets[0].topic} holds {PACKETS[packets[0].msgtype]}" if packets else ""
+        raise BeamboxError(f"{root} holds no point cloud (no message of type {POINT_CLOUD}){details}")
     if not topic and len(topics) > 1:
         raise BeamboxError(f"{root} holds point clouds under {', '.join(topics)}; name one by --topic")
     chosen = topic or topics[0]
@@ -119,18 +119,18 @@ def _choose(root: Path, topic: str, connections: list[Any]) -> list[Any]:
 def _arrival(
     reader: Any, connection: Any, time: int, raw: bytes, where: str, fields: str | None, scale: float | None
 ) -> Arrival:
-    held: list[Any] = []
+    cache: list[Any] = []
 
     def message() -> Any:
-        if not held:
-            held.append(reader.deserialize(raw, connection.msgtype))
-        return held[0]
+        if not cache:
+            cache.append(reader.deserialize(raw, connection.msgtype))
+        return cache[0]
 
     try:
         header = message().header
         stamp, frame_id = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec, str(header.frame_id)
     except Exception:  # a damaged message is told when it is read
-        held.clear()
+        cache.clear()
         stamp, frame_id = time, ""
     name = f"{stamp or time}"
 

@@ -1,7 +1,7 @@
 """What the values become elsewhere: pictures, files, other libraries' types.
 
 The types keep thin methods that call these functions. Each imports what it needs when it is called, so that a value
-costs no drawing library; this is the one file of ``structures`` that may look into ``visualise`` and ``data``, and only
+costs no drawing library; this is the one file of ``structures`` that may look into ``visualize`` and ``data``, and only
 inside its functions.
 """
 
@@ -45,7 +45,7 @@ def html_of(caption: str, picture: Image) -> str:
 
 def plot(frame: Frame | None, detections: Detections | None, labels: Labels | None, **options: Any) -> Image:
     """Draw a bird's-eye view; without a frame there are no points."""
-    from beambox.visualise.bev import draw_bev
+    from beambox.visualize.bev import draw_bev
 
     return draw_bev(_frame(frame, detections), detections, labels, **options)
 
@@ -109,13 +109,13 @@ def _save_picture(
     path: Path, frame: Frame | None, detections: Detections | None, labels: Labels | None, others: str
 ) -> Path:
     if path.suffix.lower() == ".html":
-        from beambox.visualise.viewer import viewer_html
+        from beambox.visualize.viewer import viewer_html
 
         return _write(path, viewer_html(_frame(frame, detections), detections, labels))
     if path.suffix.lower() not in PICTURES:
         raise BeamboxError(f"{path.name}: a name ends in {others}, .png, .jpg or .html, got {path.suffix or 'nothing'}")
-    from beambox.visualise.canvas import save_picture
-    from beambox.visualise.picture import draw_sweep
+    from beambox.visualize.canvas import save_picture
+    from beambox.visualize.picture import draw_sweep
 
     save_picture(draw_sweep(_frame(frame, detections), detections, labels), path)
     return path
@@ -151,14 +151,14 @@ def labels_to_kitti(labels: Labels, calibration: Calibration, image_size: tuple[
 
 def points_of(array: Any, intensity_scale: float | None) -> tuple[torch.Tensor, tuple[str, ...]]:
     """See :meth:`Frame.from_array`."""
-    from beambox.data.reading import points_from_array
+    from beambox.data.read_points import points_from_array
 
     return points_from_array(array, intensity_scale)
 
 
 def frame_from_file(path: Path, fields: str | Sequence[str] | None, intensity_scale: float | None) -> Frame:
     """See :meth:`Frame.from_file`."""
-    from beambox.data.reading import read_frame
+    from beambox.data.read_points import read_frame
 
     return read_frame(path, fields=fields, intensity_scale=intensity_scale)
 

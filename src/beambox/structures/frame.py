@@ -76,7 +76,7 @@ class Frame:
 
     @classmethod
     def from_array(cls, array: Tensor | ArrayLike, *, id: str = "", intensity_scale: float | None = None) -> Frame:
-        """Make a frame of points in memory, by the rules for files (:mod:`beambox.data.reading`).
+        """Make a frame of points in memory, by the rules for files (:mod:`beambox.data.read_points`).
 
         Args:
             array: ``(N, 3 or more)`` x, y, z in metres (LiDAR frame), intensity; further columns are left out.

@@ -41,7 +41,7 @@ def rounded(rows: Iterable[Row]) -> list[dict[str, float | str]]:
 
 
 def json_text(rows: Sequence[Row], head: Mapping[str, Any], under: str) -> str:
-    """Write one JSON object: what ``head`` holds, and the rows as a list, one a line."""
+    """Write one JSON object: what ``head`` holds, and the rows as a list, one per line."""
     objects = ",\n".join("    " + json.dumps(row) for row in rows)
     start = json.dumps(head, indent=2)[:-2] + ",\n" if head else "{\n"
     return start + f'  "{under}": [' + (f"\n{objects}\n  " if rows else "") + "]\n}\n"

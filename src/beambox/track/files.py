@@ -1,4 +1,4 @@
-"""Tracks on disk: JSON lines, CSV, or the text of KITTI's tracking benchmark; one file a drive, written as it comes."""
+"""Tracks on disk: JSON lines, CSV, or the text of KITTI's tracking benchmark; one file per drive."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def track_file(
     """Open a file of tracks for writing; its ending says which format. It appears once it is complete.
 
     Args:
-        path: .jsonl (one line a sweep), .csv (one row an object) or .txt (KITTI's tracking benchmark).
+        path: .jsonl (one line per sweep), .csv (one row per object) or .txt (KITTI's tracking benchmark).
         model: who found the boxes, kept in JSON.
         calibration: of a sweep by its name, for KITTI's format.
         image_size: (width, height) to which KITTI's image boxes are clipped.

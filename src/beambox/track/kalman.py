@@ -76,7 +76,7 @@ class BoxFilter:
 
     @property
     def covariance(self) -> Floats:
-        """``(2, 2)`` of where a detection is expected, seen from above: of the state and of the detection together."""
+        """``(2, 2)`` of where a detection is expected, in BEV: of the state and of the detection together."""
         return self._kalman.P[:2, :2] + self._kalman.R[:2, :2]
 
     def predict(self, seconds: float) -> None:

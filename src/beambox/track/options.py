@@ -16,7 +16,7 @@ __all__ = ["TrackerOptions"]
 class TrackerOptions:
     """Options of :class:`beambox.track.Tracker`."""
 
-    min_score: float = 0.1
+    score_threshold: float = 0.1
     """Detections below this score are left out."""
     birth_score: float = 0.3
     """A detection that continues no track starts one from this score on."""
@@ -29,7 +29,7 @@ class TrackerOptions:
     coast: float = 0.0
     """Seconds for which a track without a detection is reported at its predicted place."""
     gate: float = 13.8
-    """Largest squared Mahalanobis distance, seen from above, between a track and its detection (13.8: 99.9 %)."""
+    """Largest squared Mahalanobis distance, in BEV, between a track and its detection (13.8: 99.9 %)."""
     position_noise: float = 0.17
     """Standard deviation of the center of a detection along each axis, metres (0.17 measured on KITTI val cars)."""
     size_noise: float = 0.2
@@ -57,10 +57,10 @@ class TrackerOptions:
         for name in ("position_noise", "size_noise", "heading_noise", "memory", "gate"):
             if getattr(self, name) == 0:
                 raise BeamboxError(f"`{name}` must be above 0")
-        if self.birth_score < self.min_score:
+        if self.birth_score < self.score_threshold:
             raise BeamboxError(
-                f"`birth_score` ({self.birth_score}) must be at least `min_score` ({self.min_score}): what is left out "
-                "starts no track"
+                f"`birth_score` ({self.birth_score}) must be at least `score_threshold` ({self.score_threshold}): what "
+                "is left out starts no track"
             )
         if not self.death_score < self.confirm_score <= 1:
             raise BeamboxError(

@@ -34,7 +34,7 @@ class Poses:
 
 
 def read_poses(path: Path | str, calibration: Calibration | None = None) -> Poses:
-    """Read poses, one sweep a line.
+    """Read poses, one sweep per line.
 
     * 12 numbers: the rows of a ``(3, 4)`` matrix (KITTI odometry, and what KISS-ICP writes);
     * 16 numbers: the rows of a ``(4, 4)`` matrix;
@@ -67,7 +67,7 @@ def read_poses(path: Path | str, calibration: Calibration | None = None) -> Pose
         else:
             raise BeamboxError(f"{where}: a pose is 12, 16 or 8 numbers, got {len(values)}")
     if not matrices:
-        raise BeamboxError(f"{path} must hold poses, one a line, but is empty")
+        raise BeamboxError(f"{path} must hold poses, one per line, but is empty")
     if times and len(times) != len(matrices):
         raise BeamboxError(f"{path}: all lines must have a time, or none")
     stacked = np.stack(matrices)
@@ -103,7 +103,7 @@ def as_pose(pose: Tensor | Floats | Sequence | None, where: str = "a pose") -> F
 
 
 def carry_boxes(boxes: Floats, matrix: Floats) -> Floats:
-    """Carry ``(N, 7)`` boxes by a ``(4, 4)`` rigid motion; the heading follows as seen from above."""
+    """Carry ``(N, 7)`` boxes by a ``(4, 4)`` rigid motion; the heading follows as in BEV."""
     heading = np.stack((np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(len(boxes))), axis=1) @ matrix[:3, :3].T
     out = boxes.copy()
     out[:, :3] = boxes[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]

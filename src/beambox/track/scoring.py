@@ -64,11 +64,11 @@ class TrackingResult:
         for name, one in self.classes.items():
             shares = (one.hota.hota, one.hota.det_a, one.hota.ass_a, one.clear.mota, one.clear.motp)
             shares = (*shares, one.amota, one.samota)
-            told = [name, f"{one.min_overlap:g}", *(f"{100 * share:.2f}" for share in shares)]
+            cells = [name, f"{one.min_overlap:g}", *(f"{100 * share:.2f}" for share in shares)]
             clear = one.clear
-            told += [str(n) for n in (clear.switches, clear.fragments, clear.tp, clear.fp, clear.fn)]
-            told += [str(n) for n in (clear.mostly_tracked, clear.mostly_lost, clear.objects)]
-            lines.append(" ".join(f"{word:>9}" for word in told))
+            cells += [str(n) for n in (clear.switches, clear.fragments, clear.tp, clear.fp, clear.fn)]
+            cells += [str(n) for n in (clear.mostly_tracked, clear.mostly_lost, clear.objects)]
+            lines.append(" ".join(f"{word:>9}" for word in cells))
         return "\n".join(lines) + "\n"
 
     def to_json(self) -> dict[str, Any]:

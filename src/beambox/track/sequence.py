@@ -38,7 +38,7 @@ def read_drive(folder: Path, calibration: Callable[[str], Calibration] | Calibra
     Where all names are numbers, a number without a file is a frame without detections.
 
     Args:
-        folder: of .json, .csv or .txt files, one a sweep.
+        folder: of .json, .csv or .txt files, one per sweep.
         calibration: for KITTI text: of the drive, or of a sweep by its name.
 
     Raises:

@@ -104,7 +104,7 @@ class Tracker:
             raise BeamboxError("detections for tracking must be finite; leave out boxes with NaN or infinite values")
         boxes, names = carry_boxes(boxes, to_world), np.array(detections.names, dtype=object)
         strong = scores >= self.options.birth_score
-        weak = (scores >= self.options.min_score) & ~strong
+        weak = (scores >= self.options.score_threshold) & ~strong
         free = list(self._tracks)
         for kind in (strong, weak):
             free = self._match(free, boxes, scores, names, np.flatnonzero(kind), now)

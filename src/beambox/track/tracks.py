@@ -65,7 +65,7 @@ class Tracks:
 
     @property
     def speeds(self) -> Tensor:
-        """``(N,)`` metres per second, seen from above."""
+        """``(N,)`` metres per second, in BEV."""
         return self.velocities[:, :2].norm(dim=1)
 
     def to_rows(self) -> list[dict[str, float | int | str]]:

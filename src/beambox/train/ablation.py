@@ -44,7 +44,7 @@ def run_table(
     data: Path | None,
     out: Path,
     seeds: Sequence[int],
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> Measured:
     """Train and score every row of a table for every seed.
 
@@ -59,7 +59,7 @@ def run_table(
         data: folder that ``{data}`` stands for in the recipe.
         out: folder of the runs.
         seeds: one run each.
-        say: told before each run.
+        log: told before each run.
 
     Raises:
         BeamboxError: if the recipe lacks a validation source, or a folder holds runs of another recipe.
@@ -77,7 +77,7 @@ def run_table(
     measured: Measured = {row.name: [] for row, _ in trained}
     for number, (row, seed, plan) in enumerate(plans, 1):
         folder = out / recipe.name / folder_name(row.options or {}) / f"seed-{seed}"
-        say(f"row {row.name}, seed {seed} ({number} of {len(plans)}): {folder}")
+        log(f"row {row.name}, seed {seed} ({number} of {len(plans)}): {folder}")
         scores = run_row(plan, recipe, source, data, folder, out)
         measured[row.name].append([value_at(scores, column.path) for column in table.columns])
     return measured
@@ -103,9 +103,9 @@ def folder_name(options: Mapping[str, Any]) -> str:
     """Name a folder by switches: readable, and distinct for distinct switches."""
     if not options:
         return "as-recipe"
-    told = "_".join(f"{key}={json.dumps(value)}" for key, value in sorted(options.items()))
+    details = "_".join(f"{key}={json.dumps(value)}" for key, value in sorted(options.items()))
     exact = hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:6]
-    return re.sub(r"[^A-Za-z0-9=_.]+", "-", told.replace('"', ""))[:60].strip("-") + "_" + exact
+    return re.sub(r"[^A-Za-z0-9=_.]+", "-", details.replace('"', ""))[:60].strip("-") + "_" + exact
 
 
 def run_row(
@@ -113,7 +113,7 @@ def run_row(
 ) -> dict[str, Any]:
     """Train one run, or go on with it, and score its last weights; returns the scores."""
     identity = plan.model_dump(mode="json", exclude={"workers", "threads", "log_every", "save_every", "description"})
-    claim(folder, identity)
+    reserve(folder, identity)
     scored = folder / "scores.json"
     if scored.is_file():
         return read_json(scored)
@@ -127,7 +127,7 @@ def run_row(
     return scores
 
 
-def claim(folder: Path, identity: dict[str, Any]) -> None:
+def reserve(folder: Path, identity: dict[str, Any]) -> None:
     """Mark a folder as that of a run.
 
     Raises:
@@ -135,8 +135,8 @@ def claim(folder: Path, identity: dict[str, Any]) -> None:
     """
     path = folder / "recipe.json"
     if path.is_file():
-        held = read_json(path)
-        differing = sorted(key for key in {*held, *identity} if held.get(key) != identity.get(key))
+        stored = read_json(path)
+        differing = sorted(key for key in {*stored, *identity} if stored.get(key) != identity.get(key))
         if differing:
             raise BeamboxError(
                 f"{folder} holds a run of another recipe (its `{differing[0]}` differs); "

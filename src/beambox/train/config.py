@@ -69,7 +69,7 @@ class SourceSection(Section):
     """Keep only points that the camera sees (KITTI labels exist only there)."""
     weight: float | None = Field(default=None, gt=0)
     """Share of the drawn frames that come from this source, relative to the other sources' weights; where no source
-    has one, every frame is drawn once an epoch."""
+    has one, every frame is drawn once per epoch."""
     frames: int | None = Field(default=None, gt=0)
     """Use only this many frames, spread evenly over the source; number of sweeps to make where simulated."""
     objects: bool = True

@@ -34,8 +34,8 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             _lock(handle)
         except OSError:
-            held = os.pread(handle, 20, 0).decode("ascii", "replace") if hasattr(os, "pread") else ""
-            by = f" (process {held})" if held.isdigit() else ""
+            owner = os.pread(handle, 20, 0).decode("ascii", "replace") if hasattr(os, "pread") else ""
+            by = f" (process {owner})" if owner.isdigit() else ""
             raise BeamboxError(
                 f"another training writes into {folder}{by}; wait for its end, or give another --out"
             ) from None

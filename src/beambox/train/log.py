@@ -15,10 +15,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from beambox.checks import how_to_install, printable
 
-__all__ = ["Clock", "RunLog", "duration"]
+__all__ = ["RunLog", "Timer", "duration"]
 
 
-class Clock:
+class Timer:
     """Adds up the wall time of the parts of a step (on a GPU: until the work is queued, not until it is done)."""
 
     def __init__(self) -> None:
@@ -34,9 +34,9 @@ class Clock:
     def shares(self) -> str:
         """Tell each part's share, as ``4 % data, 40 % forward``, and start anew."""
         total = sum(self.seconds.values()) or 1.0
-        told = ", ".join(f"{100 * spent / total:.0f} % {part}" for part, spent in self.seconds.items())
+        details = ", ".join(f"{100 * spent / total:.0f} % {part}" for part, spent in self.seconds.items())
         self.seconds = {}
-        return told
+        return details
 
 
 def duration(seconds: float) -> str:
@@ -84,11 +84,11 @@ class RunLog:
         try:
             from torch.utils.tensorboard.writer import SummaryWriter
         except ImportError:
-            self.say(f"no TensorBoard log: tensorboard is not installed ({how_to_install('train')})")
+            self.info(f"no TensorBoard log: tensorboard is not installed ({how_to_install('train')})")
             return None
         return SummaryWriter(str(folder), purge_step=first)
 
-    def say(self, text: str) -> None:
+    def info(self, text: str) -> None:
         """Print a line; a full disk behind the console is no reason to stop."""
         if not self.active:
             return
@@ -121,10 +121,10 @@ class RunLog:
         if tuple(losses) != self._heading:
             self._heading = tuple(losses)
             names = "".join(f"{name[:9]:>10}" for name in losses)
-            self.say(f"{'step':>8}{names}{'lr':>10}{'s/step':>8}  left")
+            self.info(f"{'step':>8}{names}{'lr':>10}{'s/step':>8}  left")
         left = duration(seconds * (self.total - step))
         values = "".join(f"{value:>10.4f}" for value in losses.values())
-        self.say(f"{step:>8}{values}{lr:>10.2e}{seconds:>8.3f}  {left} (time: {times})")
+        self.info(f"{step:>8}{values}{lr:>10.2e}{seconds:>8.3f}  {left} (time: {times})")
         self.record(step, {**{f"loss/{name}": value for name, value in losses.items()}, "lr": lr, "s/step": seconds})
 
     def record(self, step: int, values: Mapping[str, float]) -> None:
@@ -137,7 +137,7 @@ class RunLog:
                     self._board.add_scalar(name, value, step)
         except OSError as error:
             if not self._lost:
-                self.say(f"warning: the log cannot be written ({error.strerror or error}); training goes on")
+                self.info(f"warning: the log cannot be written ({error.strerror or error}); training goes on")
             self._lost = True
 
     def close(self) -> None:

@@ -14,24 +14,24 @@ from beambox.checks import BeamboxError
 from beambox.data.database import ObjectDatabase
 from beambox.data.mixture import MixedSource
 from beambox.train.config import Recipe
+from beambox.train.dataset import TrainingDataset
 from beambox.train.devices import make_fabric
-from beambox.train.feed import Feed
 from beambox.train.folder import BEST, FINAL, LAST, OBJECTS, locked
 from beambox.train.log import RunLog
 from beambox.train.preflight import check_labels, check_recipe
-from beambox.train.run import Run, TrainStep
-from beambox.train.sources import Change, open_database, open_source
+from beambox.train.run import ModelWithLoss, Run
+from beambox.train.sources import Augment, open_database, open_source
 from beambox.train.start import build_detector
 from beambox.train.validate import Validator
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-__all__ = ["Outcome", "Run", "TrainStep", "train"]
+__all__ = ["ModelWithLoss", "Run", "TrainResult", "train"]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrainResult:
     """How a run ended."""
 
     step: int
@@ -46,7 +46,7 @@ class Outcome:
 
 def train(
     recipe: Recipe, data: Path | None, out: Path, resume: bool = False, shared_objects: Path | None = None
-) -> Outcome:
+) -> TrainResult:
     """Train a detector.
 
     Args:
@@ -71,17 +71,17 @@ def train(
 
 def _train(
     recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, resume: bool, shared_objects: Path | None
-) -> Outcome:
+) -> TrainResult:
     reuse = resume or shared_objects is not None
-    run = assemble(recipe, data, out, fabric, shared_objects or out / OBJECTS, reuse)
+    run = build_run(recipe, data, out, fabric, shared_objects or out / OBJECTS, reuse)
     changed = run.restore() if resume else []
     log = RunLog(out, run.total, run.step, active=fabric.global_rank == 0)
     try:
-        introduce(run, log)
+        log_header(run, log)
         if resume:
-            log.say(f"going on after step {run.step}")
+            log.info(f"going on after step {run.step}")
         if changed:
-            log.say(f"note: the recipe has changed since, so the run is not the one it would have been: {changed}")
+            log.info(f"note: the recipe has changed since, so the run is not the one it would have been: {changed}")
         finished = run.loop(log)
         run.save()
         if finished:
@@ -90,15 +90,15 @@ def _train(
                 final = run.export(FINAL, {})
             run.save()
             best = out / BEST
-            log.say(f"finished; weights: {best if run.best is not None else final}")
-            return Outcome(run.step, True, best if run.best is not None else final, run.best)
-        log.say(f"interrupted after step {run.step} of {run.total}; the same command with --resume goes on from there")
-        return Outcome(run.step, False, out / BEST if run.best is not None else None, run.best)
+            log.info(f"finished; weights: {best if run.best is not None else final}")
+            return TrainResult(run.step, True, best if run.best is not None else final, run.best)
+        log.info(f"interrupted after step {run.step} of {run.total}; the same command with --resume goes on from there")
+        return TrainResult(run.step, False, out / BEST if run.best is not None else None, run.best)
     finally:
         log.close()
 
 
-def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, objects: Path, reuse: bool) -> Run:
+def build_run(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, objects: Path, reuse: bool) -> Run:
     """Build the detector, the stream of batches and the validation that a recipe asks for.
 
     Args:
@@ -114,19 +114,21 @@ def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, objec
     check_recipe(recipe, config, fabric.world_size)
     sources = [open_source(section, data) for section in recipe.data]
     joined = MixedSource(sources, tuple(s.weight for s in recipe.data if s.weight is not None) or None)
-    check_labels(joined, "training data", config.classes, config.grid, notes.append, config.columns)
+    check_labels(joined, "training data", config.classes, config.grid, notes.append, config.num_point_features)
     validation = open_source(recipe.validation.source, data) if recipe.validation else None
     if validation is not None:
-        check_labels(validation, "validation data", config.classes, config.grid, notes.append, config.columns)
+        check_labels(
+            validation, "validation data", config.classes, config.grid, notes.append, config.num_point_features
+        )
     database = None
     if recipe.augment and recipe.augment.sample:
         if fabric.global_rank == 0:
             open_database(recipe, data, objects, reuse, lambda text: print(text, flush=True))
         fabric.barrier()
         database = ObjectDatabase.load(objects)
-    feed = Feed(
+    dataset = TrainingDataset(
         joined,
-        Change(recipe.augment, database, recipe.seed),
+        Augment(recipe.augment, database, recipe.seed),
         config.classes,
         config.grid,
         recipe.optim.batch,
@@ -135,22 +137,22 @@ def assemble(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, objec
         rank=fabric.global_rank,
         world=fabric.world_size,
     )
-    run = Run(recipe, detector, feed, fabric, out)
+    run = Run(recipe, detector, dataset, fabric, out)
     run.notes += notes
     if recipe.validation and validation is not None:
         run.validator = Validator(recipe.validation, validation, run.dtype)
     return run
 
 
-def introduce(run: Run, log: RunLog) -> None:
+def log_header(run: Run, log: RunLog) -> None:
     """Say what is about to happen."""
     recipe, fabric = run.recipe, run.fabric
     count = sum(parameter.numel() for parameter in run.detector.parameters())
-    log.say(f"beambox {__version__}: {recipe.name}, seed {recipe.seed}, {count / 1e6:.2f} M parameters")
+    log.info(f"beambox {__version__}: {recipe.name}, seed {recipe.seed}, {count / 1e6:.2f} M parameters")
     precision = str(run.dtype).removeprefix("torch.")
-    log.say(
+    log.info(
         f"{fabric.world_size} x {fabric.device.type}, {precision}, {torch.get_num_threads()} threads; "
-        f"{len(run.feed.source)} frames an epoch, {run.per_epoch:.0f} steps an epoch, {run.total} steps"
+        f"{len(run.dataset.source)} frames per epoch, {run.per_epoch:.0f} steps per epoch, {run.total} steps"
     )
     for note in run.notes:
-        log.say(note)
+        log.info(note)

@@ -73,8 +73,8 @@ def check_labels(
     what: str,
     classes: Sequence[str],
     grid: VoxelGrid,
-    say: Callable[[str], None],
-    columns: int = 4,
+    log: Callable[[str], None],
+    num_point_features: int = 4,
 ) -> None:
     """Look at the labels of some frames, spread over a source; at more while nothing in them can be learnt.
 
@@ -83,8 +83,8 @@ def check_labels(
         what: to call it in messages, such as ``training data``.
         classes: of the detector.
         grid: region that the detector looks at.
-        say: told of classes that the frames looked at lack.
-        columns: that the detector reads of each point.
+        log: told of classes that the frames looked at lack.
+        num_point_features: that the detector reads of each point.
 
     Raises:
         BeamboxError: if there is no frame, one has no labels, an object has no extent, or no object of the whole source
@@ -98,7 +98,7 @@ def check_labels(
     looked = 0
     for looked, index in enumerate(order.tolist(), 1):
         frame = source[index]
-        expect_columns(frame, columns)
+        expect_columns(frame, num_point_features)
         if frame.labels is None:
             raise BeamboxError(f"frame {frame.id} of the {what} has no labels, which the training needs")
         names.update(frame.labels.names)
@@ -117,7 +117,7 @@ def check_labels(
         raise BeamboxError(_nothing(what, looked, names, classes, grid))
     lacking = [name for name in classes if not inside[name]]
     if lacking:
-        say(f"note: no {', '.join(lacking)} in the {looked} frames of the {what} looked at; they hold {_counts(names)}")
+        log(f"note: no {', '.join(lacking)} in the {looked} frames of the {what} looked at; they hold {_counts(names)}")
 
 
 def _counts(names: Counter[str]) -> str:

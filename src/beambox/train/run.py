@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from beambox import __version__
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import config_to_dict, name_of, tensors_since
+from beambox.detectors.catalog import config_to_dict, name_of, options_since, tensors_since
 from beambox.detectors.weights import save_weights
 from beambox.infer.precision import PRECISIONS
 from beambox.train.batchnorm import measure_statistics, measured_statistics
@@ -27,10 +27,10 @@ from beambox.train.checkpoint import (
     restore_optimizer,
 )
 from beambox.train.config import Recipe
+from beambox.train.dataset import TrainingBatch, TrainingDataset, make_loader
 from beambox.train.devices import choose_precision
-from beambox.train.feed import Feed, TrainingBatch, stream
 from beambox.train.folder import BEST, LAST, PREVIOUS, keep_older
-from beambox.train.log import Clock, RunLog, duration
+from beambox.train.log import RunLog, Timer, duration
 from beambox.train.optim import Ema, adam, apply_schedule
 from beambox.train.signals import catch_signals
 from beambox.train.validate import Validator
@@ -38,10 +38,10 @@ from beambox.train.validate import Validator
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-__all__ = ["Run", "TrainStep", "random_seed"]
+__all__ = ["ModelWithLoss", "Run", "random_seed"]
 
 
-class TrainStep(nn.Module):
+class ModelWithLoss(nn.Module):
     """Network and loss as one module, so that one forward pass of it is all that mixed precision and DDP see."""
 
     def __init__(self, detector: Any) -> None:
@@ -73,10 +73,10 @@ def _settle_strides(detector: nn.Module) -> None:
 class Run:
     """A detector in training: everything that changes from step to step, and how to save and restore it."""
 
-    def __init__(self, recipe: Recipe, detector: Any, feed: Feed, fabric: Fabric, folder: Path) -> None:
-        self.recipe, self.detector, self.feed, self.fabric, self.folder = recipe, detector, feed, fabric, folder
+    def __init__(self, recipe: Recipe, detector: Any, dataset: TrainingDataset, fabric: Fabric, folder: Path) -> None:
+        self.recipe, self.detector, self.dataset, self.fabric, self.folder = recipe, detector, dataset, fabric, folder
         optim = recipe.optim
-        per_epoch = len(feed.source) / optim.batch
+        per_epoch = len(dataset.source) / optim.batch
         self.total = optim.iterations or max(1, round((optim.epochs or 0) * per_epoch))
         self.per_epoch = per_epoch
         self.step = 0
@@ -91,7 +91,7 @@ class Run:
             detector = nn.SyncBatchNorm.convert_sync_batchnorm(detector)
         if fabric.world_size > 1:
             _settle_strides(detector)
-        self.module, self.optimizer = fabric.setup(TrainStep(detector), adam(detector.parameters(), optim))
+        self.module, self.optimizer = fabric.setup(ModelWithLoss(detector), adam(detector.parameters(), optim))
         self.ema = Ema(detector, recipe.ema.decay) if recipe.ema else None
         self.names = {parameter: name for name, parameter in detector.named_parameters()}
         if recipe.compile:
@@ -108,7 +108,7 @@ class Run:
         """The module that is validated and exported: the average where there is one."""
         return self.ema.module if self.ema else self.detector
 
-    def advance(self, work: TrainingBatch, clock: Clock) -> tuple[dict[str, Tensor], float]:
+    def train_step(self, work: TrainingBatch, timer: Timer) -> tuple[dict[str, Tensor], float]:
         """Make one optimiser step; returns the losses, with ``total``, and the learning rate.
 
         Raises:
@@ -118,14 +118,14 @@ class Run:
         # Only layers that draw random numbers (dropout) need it; it makes them a function of the step, for resuming.
         torch.manual_seed(random_seed(self.recipe.seed, self.step, self.fabric.global_rank))
         lr = apply_schedule(self.optimizer.optimizer, self.recipe.optim, self.step, self.total)
-        with clock.measure("forward"):
+        with timer.measure("forward"):
             losses = self.module(work.to(self.fabric.device))
             total = torch.stack(list(losses.values())).sum()
         if self.fabric.world_size == 1 and not bool(torch.isfinite(total)):
             raise BeamboxError(self._not_finite("the loss", losses, work))
-        with clock.measure("backward"):
+        with timer.measure("backward"):
             self.fabric.backward(total)
-        with clock.measure("optim"):
+        with timer.measure("optim"):
             norm = self.fabric.clip_gradients(
                 self.module, self.optimizer, max_norm=self.recipe.optim.clip or math.inf, error_if_nonfinite=False
             )
@@ -141,11 +141,11 @@ class Run:
         return {**{name: value.detach() for name, value in losses.items()}, "total": total.detach()}, lr
 
     def _not_finite(self, what: str, losses: Mapping[str, Tensor], work: TrainingBatch) -> str:
-        told = ", ".join(f"{name} {value.item():.4g}" for name, value in losses.items())
+        details = ", ".join(f"{name} {value.item():.4g}" for name, value in losses.items())
         of = [n for p, n in self.names.items() if p.grad is not None and not bool(torch.isfinite(p.grad).all())]
         where = f", of {of[0]} and {len(of) - 1} more" if of else ""
         return (
-            f"{what} is not finite at step {self.step} ({told}{where}) on frames {', '.join(work.batch.frame_ids)}; "
+            f"{what} is not finite at step {self.step} ({details}{where}) on frames {', '.join(work.batch.frame_ids)}; "
             "the weights were not changed; the last checkpoint is from an earlier step; look at these frames or lower "
             "optim.lr"
         )
@@ -202,8 +202,10 @@ class Run:
             self.fabric.strategy.precision.load_state_dict(saved.state["precision"])
         self.step, self.best = saved.step, saved.state["best"]
         self.validated = saved.state.get("validated", saved.step)
-        now = self.recipe.model_dump(mode="json")
-        return [key for key in now if now[key] != saved.recipe.get(key)]
+        now, then = self.recipe.model_dump(mode="json"), saved.recipe
+        for plain in (now, then):
+            plain["detector"]["options"] = options_since(own["name"], plain["detector"]["options"])
+        return [key for key in now if now[key] != then.get(key)]
 
     @contextmanager
     def measured(self) -> Iterator[None]:
@@ -219,8 +221,8 @@ class Run:
         first = max(0, self.step - self.recipe.batchnorm_batches)
         if first == self.step:
             return
-        network, seed, rank = TrainStep(self.result), self.recipe.seed, self.fabric.global_rank
-        numbered = enumerate(stream(self.feed, first, self.step, self.recipe.workers), first)
+        network, seed, rank = ModelWithLoss(self.result), self.recipe.seed, self.fabric.global_rank
+        numbered = enumerate(make_loader(self.dataset, first, self.step, self.recipe.workers), first)
 
         def forward(work: tuple[int, TrainingBatch]) -> None:
             torch.manual_seed(random_seed(seed, work[0], rank))  # a second stage draws its regions
@@ -250,8 +252,8 @@ class Run:
             self.best = score.value
             self.export(BEST, {"validation": score.table})
         self.validated = self.step
-        log.say(f"validation after step {self.step}: {score.text}{'  (best so far)' if better else ''}")
-        log.say(f"  took {duration(time.perf_counter() - start)}")
+        log.info(f"validation after step {self.step}: {score.text}{'  (best so far)' if better else ''}")
+        log.info(f"  took {duration(time.perf_counter() - start)}")
         log.record(self.step, {f"validation/{name}": value for name, value in score.scalars.items()})
         self.fabric.barrier()
 
@@ -262,25 +264,25 @@ class Run:
 
     def loop(self, log: RunLog) -> bool:
         """Train to the end; False where a signal stopped it before."""
-        recipe, clock, waiting = self.recipe, Clock(), Clock()
+        recipe, timer, waiting = self.recipe, Timer(), Timer()
         sums: dict[str, Tensor] = {}
         since, mark = time.perf_counter(), self.step
         with catch_signals() as stopped:
-            batches = stream(self.feed, self.step, self.total, recipe.workers)
+            batches = make_loader(self.dataset, self.step, self.total, recipe.workers)
             self.module.train()
             if self.validation_due():
                 with self.measured():
                     self.validate(log)
-            while self.step < self.total and not self.agree(stopped()):
-                with clock.measure("data"):
+            while self.step < self.total and not self.should_stop(stopped()):
+                with timer.measure("data"):
                     work = next(batches)
-                losses, lr = self.advance(work, clock)
+                losses, lr = self.train_step(work, timer)
                 sums = {name: sums.get(name, 0) + value for name, value in losses.items()}
                 log.progress(self.step)
                 if self.step % recipe.log_every == 0 or self.step == self.total:
                     steps = self.step - mark
                     means = {name: self.fabric.all_reduce(v / steps).item() for name, v in sums.items()}  # pyright: ignore
-                    log.losses(self.step, means, lr, clock.shares(), (time.perf_counter() - since) / steps)
+                    log.losses(self.step, means, lr, timer.shares(), (time.perf_counter() - since) / steps)
                     sums, since, mark = {}, time.perf_counter(), self.step
                 with waiting.measure("other"):
                     if self.step % recipe.save_every == 0 and self.step < self.total:
@@ -296,9 +298,9 @@ class Run:
         try:
             self.save()
         except BeamboxError as error:
-            log.say(f"warning: {error}; training goes on")
+            log.info(f"warning: {error}; training goes on")
 
-    def agree(self, stop: bool) -> bool:
+    def should_stop(self, stop: bool) -> bool:
         """Whether to stop: where there are several processes they ask each other every 10 steps, to stop together."""
         if self.fabric.world_size == 1:
             return stop

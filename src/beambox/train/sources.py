@@ -19,7 +19,7 @@ from beambox.data.source import FrameSource, SubsetSource
 from beambox.structures import Frame
 from beambox.train.config import AugmentSection, Recipe, SourceSection
 
-__all__ = ["Change", "open_database", "open_source", "shared_database"]
+__all__ = ["Augment", "open_database", "open_source", "shared_database"]
 
 
 def open_source(section: SourceSection, data: Path | None) -> FrameSource:
@@ -110,11 +110,11 @@ def shared_database(recipe: Recipe, data: Path | None, folder: Path) -> Path | N
         for section, source in object_sources(recipe, data)
     ]
     where = None if data is None else str(data.resolve())
-    told = [where, sources, list(recipe.augment.sample), recipe.augment.object_min_points]
-    return folder / f"objects-{hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]}.npz"
+    identity = [where, sources, list(recipe.augment.sample), recipe.augment.object_min_points]
+    return folder / f"objects-{hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:12]}.npz"
 
 
-def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, say: Callable[[str], None]) -> None:
+def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, log: Callable[[str], None]) -> None:
     """Cut the objects for sampling out of the recipe's sources into ``file``.
 
     Args:
@@ -122,7 +122,7 @@ def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, sa
         data: folder that ``{data}`` stands for.
         file: where the database goes.
         reuse: take a file that is there already, as when a run is resumed.
-        say: told what happens.
+        log: told what happens.
     """
     assert recipe.augment is not None
     if reuse and file.exists():
@@ -130,16 +130,16 @@ def open_database(recipe: Recipe, data: Path | None, file: Path, reuse: bool, sa
     parts = []
     for section, source in object_sources(recipe, data):
         where = "the simulator" if section.kind == "simulated" else f"{folder_of(section, data)} {section.split}"
-        say(f"cutting objects out of the {len(source)} frames of {where}")
+        log(f"cutting objects out of the {len(source)} frames of {where}")
         parts.append(ObjectDatabase.build(source, tuple(recipe.augment.sample), recipe.augment.object_min_points))
     if not parts:
         raise BeamboxError("augment.sample needs objects: let at least one source of `data` have `objects: true`")
     database = ObjectDatabase.joined(parts)
-    say(f"object database: {', '.join(f'{count} {name}' for name, count in database.counts().items())}")
+    log(f"object database: {', '.join(f'{count} {name}' for name, count in database.counts().items())}")
     database.save(file)
 
 
-class Change:
+class Augment:
     """Augments the frame at a position of the run; a pure function of frame, position and random generator."""
 
     def __init__(self, section: AugmentSection | None, database: ObjectDatabase | None, seed: int) -> None:

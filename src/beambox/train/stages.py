@@ -10,7 +10,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.train.config import Recipe, apply_overrides, load_recipe, parse_recipe
-from beambox.train.loop import FINAL, LAST, Outcome, train
+from beambox.train.loop import FINAL, LAST, TrainResult, train
 
 __all__ = ["read_stages", "train_stages"]
 
@@ -44,7 +44,7 @@ def read_stages(path: str | Path, overrides: Sequence[str] = ()) -> list[Recipe]
     ]
 
 
-def train_stages(recipes: Sequence[Recipe], data: Path | None, out: Path, resume: bool = False) -> Outcome:
+def train_stages(recipes: Sequence[Recipe], data: Path | None, out: Path, resume: bool = False) -> TrainResult:
     """Train the stages one after the other.
 
     Args:
@@ -57,9 +57,9 @@ def train_stages(recipes: Sequence[Recipe], data: Path | None, out: Path, resume
         BeamboxError: for anything that :func:`~beambox.train.loop.train` refuses.
     """
     folders = [out / f"stage{number}" for number in range(1, len(recipes))] + [out]
-    held = [folder for folder in folders if (folder / LAST).exists()]
-    if held and not resume:
-        raise BeamboxError(f"{held[0]} holds a run already; go on with it by --resume, or give another --out")
+    started = [folder for folder in folders if (folder / LAST).exists()]
+    if started and not resume:
+        raise BeamboxError(f"{started[0]} holds a run already; go on with it by --resume, or give another --out")
     outcome = None
     for number, (recipe, folder) in enumerate(zip(recipes, folders)):
         if resume and folder != out and (folder / FINAL).exists():

@@ -9,11 +9,10 @@ import torch
 from torch import nn
 
 from beambox.checks import BeamboxError
-from beambox.detectors.catalogue import build, tensors_since
-from beambox.detectors.renames import current_fields
+from beambox.detectors.catalog import build, options_since, tensors_since
 from beambox.detectors.weights import WeightFile, read_weights, warn_of_licence
-from beambox.infer.predictor import find_weights
 from beambox.train.config import DetectorSection
+from beambox.zoo import find_weights
 
 __all__ = ["build_detector", "take_over"]
 
@@ -41,7 +40,8 @@ def build_detector(section: DetectorSection, seed: int) -> tuple[nn.Module, list
             f"detector.start_from: {section.start_from} holds a {stored.detector}, the recipe trains a {section.name}"
         )
     warn_of_licence(Path(section.start_from).stem, str(stored.card.get("licence", "")))
-    detector = _fresh(section.name, _over(current_fields(stored.config), current_fields(section.options)), seed)
+    base, changes = (options_since(section.name, options) for options in (stored.config, section.options))
+    detector = _fresh(section.name, _over(base, changes), seed)
     return detector, take_over(detector, stored, section.start_from)
 
 
@@ -80,12 +80,12 @@ def take_over(detector: nn.Module, stored: WeightFile, where: str) -> list[str]:
     lines = [f"started from {where}: {len(fitting)} of {len(own)} tensors"]
     fresh = [name for name in own if name not in fitting]
     if fresh:
-        told = [
+        replaced = [
             f"{name} {tuple(theirs[name].shape)} -> {tuple(own[name].shape)}"
             if name in theirs
             else f"{name} (not in the weights)"
             for name in fresh
         ]
-        more = f" and {len(told) - SHOWN} more" if len(told) > SHOWN else ""
-        lines.append(f"  begun anew, as their shapes differ: {', '.join(told[:SHOWN])}{more}")
+        more = f" and {len(replaced) - SHOWN} more" if len(replaced) > SHOWN else ""
+        lines.append(f"  begun anew, as their shapes differ: {', '.join(replaced[:SHOWN])}{more}")
     return lines

@@ -83,7 +83,7 @@ KASSD: dict[str, Table] = {
         recipe="kassd-whut",
         columns=(Column("Car 3-D R11", "all objects", ("Car", "3d", "R11", 0)),),
         rows=(
-            Row("SECOND", (72.31,), {"llm": False, "kam": False, "swapped": True}),
+            Row("SECOND", (72.31,), {"llm": False, "kam": False, "swap_cls_loc_weights": True}),
             Row("KASSD", (73.28,), {}),
         ),
         remarks=(
@@ -141,7 +141,7 @@ KASSD: dict[str, Table] = {
         rows=(
             Row("Point-GNN", (643.0,)),
             Row("Associate-3Ddet", (60.0,)),
-            Row("SECOND", (46.3,), {"llm": False, "kam": False, "swapped": True}),
+            Row("SECOND", (46.3,), {"llm": False, "kam": False, "swap_cls_loc_weights": True}),
             Row("3DSSD", (38.0,)),
             Row("KASSD", (45.9,), {}),
         ),
@@ -157,7 +157,7 @@ KASSD: dict[str, Table] = {
         columns=CAR_3D_R11,
         rows=(
             Row("class 2, box 1", (90.14, 80.06, 78.91), {}),
-            Row("class 1, box 2", (None, None, None), {"swapped": True}),
+            Row("class 1, box 2", (None, None, None), {"swap_cls_loc_weights": True}),
         ),
         remarks=("not a table of the paper: section 4.2 names the weights without saying which is whose",),
     ),

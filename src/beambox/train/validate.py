@@ -17,7 +17,7 @@ from beambox.metrics.once_result import OnceResult
 from beambox.train.config import ValidationSection
 from beambox.train.preflight import check_validation
 
-__all__ = ["Score", "Validator", "score_by", "summarise", "summarise_once"]
+__all__ = ["Score", "Validator", "score_by", "summarize", "summarize_once"]
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Validator:
         share = SubsetSource(self.source, mine) if processes > 1 else self.source
         frames = scored_frames(detect_frames(network(model, self.dtype), share))
         result = score_by(section, gathered(frames, rank, processes), classes)
-        score = summarise_once(result, section) if isinstance(result, OnceResult) else summarise(result, section)
+        score = summarize_once(result, section) if isinstance(result, OnceResult) else summarize(result, section)
         precision = str(self.dtype).removeprefix("torch.")
         table = {name: {**entry, "precision": precision} for name, entry in score.table.items()}
         return replace(score, text=f"{score.text} ({precision})", table=table)
@@ -85,7 +85,7 @@ def score_by(
     return score_frames(frames, classes, section.iou or None, section.level != "all")
 
 
-def summarise(result: KittiResult, section: ValidationSection) -> Score:
+def summarize(result: KittiResult, section: ValidationSection) -> Score:
     """Pick the recipe's number out of a result."""
     level = result.levels.index(section.level) if section.level in result.levels else 0
     scalars = {}
@@ -96,15 +96,15 @@ def summarise(result: KittiResult, section: ValidationSection) -> Score:
     known = [value for value in scalars.values() if not math.isnan(value)]
     mean = sum(known) / len(known) if known else math.nan
     value = mean if section.choose_by == "mean" else scalars[section.choose_by]
-    told = ", ".join(f"{name} {'-' if math.isnan(v) else f'{v:.2f}'}" for name, v in scalars.items())
+    details = ", ".join(f"{name} {'-' if math.isnan(v) else f'{v:.2f}'}" for name, v in scalars.items())
     protocol = f"{section.view} {section.recalls} {result.levels[level]}"
     logged = {name: v for name, v in {**scalars, "mean": mean}.items() if not math.isnan(v)}
-    return Score(value, f"{protocol} {told}, mean {mean:.2f}", logged, result.to_json())
+    return Score(value, f"{protocol} {details}, mean {mean:.2f}", logged, result.to_json())
 
 
-def summarise_once(result: OnceResult, section: ValidationSection) -> Score:
+def summarize_once(result: OnceResult, section: ValidationSection) -> Score:
     """Pick the recipe's number out of a result by ONCE's rules: the column ``overall`` of a class, or its mean."""
     scalars = {name: row[0] for name, row in zip(result.classes, result.ap)}
     scalars["mean"] = result.mean()[0]
-    told = ", ".join(f"{name} {value:.2f}" for name, value in scalars.items())
-    return Score(scalars[section.choose_by], f"ONCE AP overall {told}", scalars, result.to_json())
+    details = ", ".join(f"{name} {value:.2f}" for name, value in scalars.items())
+    return Score(scalars[section.choose_by], f"ONCE AP overall {details}", scalars, result.to_json())

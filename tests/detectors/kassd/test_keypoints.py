@@ -97,7 +97,7 @@ def test_points_are_numbered_as_drawn() -> None:
             assert points[number].tolist() == pytest.approx([column - 2.5, 2 - row])
 
 
-def test_the_extra_point_may_be_the_centre() -> None:
+def test_the_extra_point_may_be_the_center() -> None:
     points = KeypointLayout(extra_point=ExtraPoint.CENTER).points(GOLDEN_BOX, NOWHERE)
     assert points[0, -1].tolist() == [10.0, 2.0]
     assert KeypointLayout(m=0, n=0, d=1, e=1).points(GOLDEN_BOX, NOWHERE + 7).tolist() == [[[7.0, 7.0]]]

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from beambox.detectors.kassd.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
+from beambox.detectors.kassd.necks import DenseASPP, PyramidAttention, SpatialPyramidPooling
 from beambox.detectors.kassd.network import FeatureReuse, LamReduce, LocationAttention, location_attention
 
 
@@ -82,7 +82,7 @@ def test_sizes_are_kept_odd_ones_too(size: tuple[int, int]) -> None:
     bev = torch.rand(2, 6, *size)
     for module in (LocationAttention(6, 8), PyramidAttention(6, 8, (1, 1, 1))):
         assert module.eval()(bev).shape == (2, 8, *size)
-    for module in (DenseAspp(8), SpatialPyramidPooling(8)):
+    for module in (DenseASPP(8), SpatialPyramidPooling(8)):
         assert module.eval()(torch.rand(2, 8, *size)).shape == (2, 8, *size)
 
 
@@ -99,7 +99,7 @@ def test_pooling_sees_the_largest_window_and_no_further() -> None:
 
 def test_dense_dilated_convolutions_reach_their_sum() -> None:
     torch.manual_seed(0)
-    module = DenseAspp(8)
+    module = DenseASPP(8)
     for layer in module.modules():
         if isinstance(layer, torch.nn.Conv2d):
             torch.nn.init.constant_(layer.weight, 0.1)  # so that no ReLU hides the reach

@@ -24,10 +24,10 @@ def test_attention_and_gradients_equal_reference(shape, window, dtype):
     parts = [part.to(DEVICE, dtype) for part in parts]
     cotangent = parts.pop(3)
     ours, theirs = ([part.clone().requires_grad_() for part in parts] for _ in range(2))
-    got, want = neighborhood_attention(*ours, window), reference.neighborhood_attention(*theirs, window)
+    actual, want = neighborhood_attention(*ours, window), reference.neighborhood_attention(*theirs, window)
     close = {"rtol": 1e-10, "atol": 1e-12} if dtype == torch.float64 else {"rtol": 1e-4, "atol": 1e-5}
-    torch.testing.assert_close(got, want, **close)
-    got.backward(cotangent)
+    torch.testing.assert_close(actual, want, **close)
+    actual.backward(cotangent)
     want.backward(cotangent)
     for mine, other in zip(ours, theirs):
         torch.testing.assert_close(mine.grad, other.grad, **close)
@@ -36,6 +36,6 @@ def test_attention_and_gradients_equal_reference(shape, window, dtype):
 def test_half_precision_stays_half_and_close():
     q, k, v = torch.randn(3, 1, 1, 4, 5, 4, generator=torch.Generator().manual_seed(1)).to(DEVICE)
     bias = torch.zeros(1, 5, 5, device=DEVICE)
-    got = neighborhood_attention(*(part.bfloat16() for part in (q, k, v, bias)), window=3)
-    assert got.dtype == torch.bfloat16
-    torch.testing.assert_close(got.float(), reference.neighborhood_attention(q, k, v, bias, 3), rtol=5e-2, atol=5e-2)
+    actual = neighborhood_attention(*(part.bfloat16() for part in (q, k, v, bias)), window=3)
+    assert actual.dtype == torch.bfloat16
+    torch.testing.assert_close(actual.float(), reference.neighborhood_attention(q, k, v, bias, 3), rtol=5e-2, atol=5e-2)

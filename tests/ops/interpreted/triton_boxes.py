@@ -34,16 +34,16 @@ def awkward(count):
 
 
 @pytest.mark.parametrize(
-    ("door", "twin"),
+    ("frontend", "twin"),
     [(iou_bev, plain.iou_bev), (iou_3d, plain.iou_3d), (intersection_bev, plain.intersection_bev)],
     ids=["bev", "3d", "area"],
 )
 @pytest.mark.parametrize(("rows", "columns"), [(40, 37), (0, 5), (5, 0), (1, 1)])
-def test_overlaps_equal_reference(door, twin, rows, columns):
+def test_overlaps_equal_reference(frontend, twin, rows, columns):
     a, b = awkward(40)
-    got, want = door(a[:rows], b[:columns]), twin(a[:rows], b[:columns])
-    assert got.shape == (rows, columns)
-    torch.testing.assert_close(got, want, rtol=0, atol=1e-9)
+    actual, want = frontend(a[:rows], b[:columns]), twin(a[:rows], b[:columns])
+    assert actual.shape == (rows, columns)
+    torch.testing.assert_close(actual, want, rtol=0, atol=1e-9)
 
 
 def test_trapezia_agree_with_clipping_on_many_pairs():
@@ -51,8 +51,8 @@ def test_trapezia_agree_with_clipping_on_many_pairs():
     a, b = random_boxes(100, generator, 4).to(DEVICE), random_boxes(100, generator, 4).to(DEVICE)
     a[:50, 6] = torch.round(a[:50, 6])
     b[:50, 6] = a[:50, 6] + (torch.rand(50, generator=generator, dtype=torch.float64) * 1e-9).to(DEVICE)
-    got, want = gpu.intersection_bev(a, b), plain.intersection_bev(a, b)
-    torch.testing.assert_close(got, want, rtol=0, atol=1e-7)
+    actual, want = gpu.intersection_bev(a, b), plain.intersection_bev(a, b)
+    torch.testing.assert_close(actual, want, rtol=0, atol=1e-7)
     assert int((want > 0).sum()) > 2500
 
 
@@ -62,8 +62,8 @@ def test_nms_equals_reference(count, threshold):
     boxes = random_boxes(count, generator, 6, torch.float32).to(DEVICE)
     scores = torch.rand(count, generator=generator).to(DEVICE)
     for limits in ((4096, 500), (70, 7)):
-        got = nms(boxes, scores, threshold, *limits).tolist()
-        assert edit_distance(got, plain_nms.nms(boxes, scores, threshold, *limits).tolist()) == 0
+        actual = nms(boxes, scores, threshold, *limits).tolist()
+        assert edit_distance(actual, plain_nms.nms(boxes, scores, threshold, *limits).tolist()) == 0
 
 
 @pytest.mark.parametrize(
@@ -74,9 +74,9 @@ def test_nms_of_samples_equals_reference(places, post, extent):
     boxes = random_boxes(4 * places, generator, extent, torch.float32).view(4, places, 7).to(DEVICE)
     boxes[1] = boxes[1, :1]  # all the same
     count = torch.tensor([places, places, 0, places // 2], device=DEVICE)
-    got, want = (run(boxes, count, 0.1, post) for run in (nms_of_samples, plain_nms.nms_of_samples))
-    assert got[0].equal(want[0]) and got[1].equal(want[1])
-    assert got[1][1] == 1 and got[1][2] == 0
+    actual, want = (run(boxes, count, 0.1, post) for run in (nms_of_samples, plain_nms.nms_of_samples))
+    assert actual[0].equal(want[0]) and actual[1].equal(want[1])
+    assert actual[1][1] == 1 and actual[1][2] == 0
 
 
 def test_a_chain_of_boxes_each_over_the_next_keeps_every_other():
@@ -96,15 +96,15 @@ def test_segments_and_their_gradients_equal_reference(rows, columns, size, dtype
     segment = torch.randint(0, max(size, 1), (rows,), generator=generator).to(DEVICE)
     cotangent = torch.randn(size, columns, generator=generator).to(DEVICE, dtype)
     close = {"rtol": 2e-2, "atol": 2e-2} if dtype == torch.bfloat16 else {"rtol": 1e-5, "atol": 1e-6}
-    for door, twin in (
+    for frontend, twin in (
         (segment_sum, plain_scatter.segment_sum),
         (segment_mean, plain_scatter.segment_mean),
         (segment_max, plain_scatter.segment_max),
     ):
         ours, theirs = values.clone().requires_grad_(), values.clone().requires_grad_()
-        got, want = door(ours, segment, size), twin(theirs, segment, size)
-        torch.testing.assert_close(got, want, **close)
-        got.backward(cotangent)
+        actual, want = frontend(ours, segment, size), twin(theirs, segment, size)
+        torch.testing.assert_close(actual, want, **close)
+        actual.backward(cotangent)
         want.backward(cotangent)
         torch.testing.assert_close(ours.grad, theirs.grad, **close)
 

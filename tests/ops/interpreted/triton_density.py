@@ -15,8 +15,8 @@ def test_ball_count_equals_reference(count, levels, radius):
     sizes = (2, levels, 12, 12)
     index = torch.stack([torch.randint(0, size, (count,), generator=generator) for size in sizes], dim=1).to(DEVICE)
     index[:, 1] -= 7
-    got = ball_count(index, (0.1, 0.1, 0.15), radius)
-    assert got.tolist() == reference.ball_count(index, (0.1, 0.1, 0.15), radius).tolist()
+    actual = ball_count(index, (0.1, 0.1, 0.15), radius)
+    assert actual.tolist() == reference.ball_count(index, (0.1, 0.1, 0.15), radius).tolist()
 
 
 def test_ball_count_of_full_columns():
@@ -27,6 +27,6 @@ def test_ball_count_of_full_columns():
 
 def test_several_radii_with_known_extent_and_voxels_that_stand_twice():
     index = torch.tensor([[0, 0, 0, 0], [1, 70, 3, 4], [1, 69, 3, 4], [1, 70, 3, 4], [1, 70, 5, 4]], device=DEVICE)
-    got = ball_counts(index, (0.1, 0.2, 0.3), (0.35, 0.5), (2, 71, 6, 5))
-    assert got.equal(reference.ball_counts(index, (0.1, 0.2, 0.3), (0.35, 0.5)))
-    assert got.tolist() == [[1, 1], [2, 3], [2, 3], [2, 3], [1, 3]]  # 0.3 up, 0.4 aside, 0.5 both
+    actual = ball_counts(index, (0.1, 0.2, 0.3), (0.35, 0.5), (2, 71, 6, 5))
+    assert actual.equal(reference.ball_counts(index, (0.1, 0.2, 0.3), (0.35, 0.5)))
+    assert actual.tolist() == [[1, 1], [2, 3], [2, 3], [2, 3], [1, 3]]  # 0.3 up, 0.4 aside, 0.5 both

@@ -7,9 +7,9 @@ import torch
 from torch import nn
 
 from beambox.layers.heads import PostProcess
-from beambox.layers.roi import ProposalLimits
+from beambox.layers.roi import NmsConfig
 from beambox.structures import Batch
-from oracles.small_detectors import CAR, SMALL, car_frame, first_stage, made, total
+from oracles.small_detectors import CAR, SMALL, build_small, car_frame, first_stage, total
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 LOW = PostProcess(score_threshold=0.009, nms_iou=0.1, nms_pre=64, nms_post=12)
@@ -19,11 +19,11 @@ LOW = PostProcess(score_threshold=0.009, nms_iou=0.1, nms_pre=64, nms_post=12)
 def detector(name):
     config = replace(SMALL[name], post=LOW)
     if hasattr(config, "test_proposals"):
-        limits = ProposalLimits(60, 4, 0.7)
+        limits = NmsConfig(60, 4, 0.7)
         config = replace(config, test_proposals=limits, train_proposals=limits)
     if hasattr(config, "kam_options"):
         config = replace(config, kam_options=replace(config.kam_options, threshold=0.009, test_boxes=60))
-    model = made(name, config)
+    model = build_small(name, config)
     for layer in model.modules():
         if isinstance(layer, nn.Dropout):
             layer.p = 0.0
@@ -55,12 +55,12 @@ def test_detections_are_those_of_the_references(name, monkeypatch):
         monkeypatch.setenv("BEAMBOX_BACKEND", "triton")
         there = model.to(DEVICE)
         predicted = there(given.to(DEVICE))
-        got = there.decode(predicted)
+        actual = there.decode(predicted)
     for part in ("cls", "box", "direction"):
         mine, other = (getattr(first_stage(p), part).cpu() for p in (predicted, expected))
         torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-4)
     assert max(len(one) for one in want) > 0, "detections of nothing would prove nothing"
-    for mine, other in zip(got, want, strict=True):
+    for mine, other in zip(actual, want, strict=True):
         assert mine.boxes.device.type == "cpu"
         torch.testing.assert_close(mine.scores, other.scores, rtol=1e-3, atol=1e-4)
         alone = ((other.scores[:, None] - other.scores).abs() < 1e-4).sum(
@@ -73,7 +73,7 @@ def test_detections_are_those_of_the_references(name, monkeypatch):
 @pytest.mark.parametrize("name", ["voxel_rcnn", "kassd"])
 def test_losses_and_gradients_are_those_of_the_references(name, monkeypatch):
     given, model = batch(empty=False), detector(name)
-    told = []
+    results = []
     for backend, device in (("reference", "cpu"), ("triton", DEVICE)):
         monkeypatch.setenv("BEAMBOX_BACKEND", backend)
         model.to(device).train().zero_grad()
@@ -81,9 +81,9 @@ def test_losses_and_gradients_are_those_of_the_references(name, monkeypatch):
         losses = model.loss(model(given.to(device), labels=given.labels), given.labels)
         total(losses).backward()
         gradients = {key: p.grad.cpu().clone() for key, p in model.named_parameters() if p.grad is not None}
-        told.append(({key: value.detach().cpu() for key, value in losses.items()}, gradients))
-    (want, theirs), (got, ours) = told
-    torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4)
+        results.append(({key: value.detach().cpu() for key, value in losses.items()}, gradients))
+    (want, theirs), (actual, ours) = results
+    torch.testing.assert_close(actual, want, rtol=1e-3, atol=1e-4)
     assert ours.keys() == theirs.keys()
     for key, gradient in theirs.items():
         assert (ours[key] - gradient).norm() <= 2e-2 * gradient.norm() + 1e-4, key

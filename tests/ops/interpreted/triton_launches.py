@@ -18,10 +18,10 @@ if os.environ.get("TRITON_INTERPRET") != "1":
 from torch.utils._python_dispatch import _disable_current_modes
 from triton.runtime import interpreter
 
-from beambox.detectors.catalogue import CATALOGUE, build
+from beambox.detectors.catalog import CATALOG, build
 from beambox.geometry.grid import VoxelGrid
 from beambox.infer.predictor import Detector
-from beambox.layers.roi import ProposalLimits
+from beambox.layers.roi import NmsConfig
 from beambox.structures import Batch
 from beambox.train.config import read_recipe
 from oracles.launches import Launches
@@ -57,11 +57,11 @@ def shrunk(name):
     grid = VoxelGrid((x, -16 * cell[1], z), (x + 32 * cell[0], 16 * cell[1], config.grid.maximum[2]), cell)
     changed = {"grid": grid, "post": replace(config.post, nms_pre=64, nms_post=20)}
     if hasattr(config, "test_proposals"):
-        changed |= {"test_proposals": ProposalLimits(64, 6, 0.7), "lattice": 2}
+        changed |= {"test_proposals": NmsConfig(64, 6, 0.7), "grid_size": 2}
     if hasattr(config, "kam_options"):
         changed["kam_options"] = replace(config.kam_options, test_boxes=64)
     torch.manual_seed(0)
-    return CATALOGUE[name].build(replace(config, **changed)).eval()
+    return CATALOG[name].build(replace(config, **changed)).eval()
 
 
 def sweeps(grid, size):
@@ -81,7 +81,7 @@ def stages_of(model, total):
     return notes
 
 
-@pytest.mark.parametrize(("name", "size"), [*((name, 1) for name in CATALOGUE), ("second", 3), ("hcnet", 3)])
+@pytest.mark.parametrize(("name", "size"), [*((name, 1) for name in CATALOG), ("second", 3), ("hcnet", 3)])
 def test_a_pass_is_few_launches_and_hardly_waits(name, size, kernels):
     detector = Detector(shrunk(name), device="cpu", precision="float32")
     batch = sweeps(detector.grid, size)

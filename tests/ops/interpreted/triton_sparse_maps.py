@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from beambox.ops import sparse_conv
-from beambox.ops.sparse_conv import Geometry, Sites, find_chain, gpu_maps, kernel_map, reference
+from beambox.ops.sparse_conv import ConvSpec, Sites, find_chain, gpu_maps, kernel_map, reference
 from beambox.ops.sparse_conv.pairs import input_rows
 from beambox.ops.sparse_conv.sites import indices_of
 from beambox.ops.voxel_query import reference as plain_query
@@ -13,11 +13,11 @@ from oracles.sparse_conv import random_sparse
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 GEOMETRIES = (
-    Geometry.centred((3, 3, 3)),
-    Geometry.centred((1, 3, 3), (1, 2, 1)),
-    Geometry((3, 3, 3), (2, 2, 2), (1, 1, 1)),
-    Geometry((3, 1, 2), (2, 1, 2), (0, 0, 1)),
-    Geometry((2, 2, 1), (3, 1, 2), (1, 0, 1), (2, 3, 1)),
+    ConvSpec.centered((3, 3, 3)),
+    ConvSpec.centered((1, 3, 3), (1, 2, 1)),
+    ConvSpec((3, 3, 3), (2, 2, 2), (1, 1, 1)),
+    ConvSpec((3, 1, 2), (2, 1, 2), (0, 0, 1)),
+    ConvSpec((2, 2, 1), (3, 1, 2), (1, 0, 1), (2, 3, 1)),
 )
 
 
@@ -26,28 +26,28 @@ def sites_of(seed, shape=(4, 5, 6), density=0.15, empty=()):
     return Sites.of(x.indices.to(DEVICE), x.shape, x.batch_size)
 
 
-@pytest.mark.parametrize("geometry", GEOMETRIES, ids=str)
+@pytest.mark.parametrize("spec", GEOMETRIES, ids=str)
 @pytest.mark.parametrize(("density", "empty"), [(0.15, ()), (1.0, (0,)), (0.0, ())])
-def test_maps_equal_reference(geometry, density, empty):
+def test_maps_equal_reference(spec, density, empty):
     sites = sites_of(1, density=density, empty=empty)
     assert sites.indices.equal(indices_of(sites.sorted_keys, sites.order, sites.shape))
-    found = kernel_map(sites, geometry)
-    if not geometry.submanifold:
-        assert found.target.sorted_keys.equal(reference.find_targets(sites, geometry))
-    table = reference.neighbour_table(sites, found.target, geometry)
+    found = kernel_map(sites, spec)
+    if not spec.submanifold:
+        assert found.target.sorted_keys.equal(reference.find_targets(sites, spec))
+    table = reference.neighbor_table(sites, found.target, spec)
     assert found.kept(input_rows).equal(table)
     assert gpu_maps.inverse_table(table, len(sites)).equal(reference.inverse_table(table, len(sites)))
 
 
 def test_a_chain_is_what_its_links_are():
-    chain = (GEOMETRIES[2], Geometry((3, 3, 3), (2, 2, 2), (0, 1, 1)), Geometry((3, 1, 1), (2, 1, 1)))
+    chain = (GEOMETRIES[2], ConvSpec((3, 3, 3), (2, 2, 2), (0, 1, 1)), ConvSpec((3, 1, 1), (2, 1, 1)))
     one, other = (sites_of(2, (15, 8, 6), 0.05) for _ in range(2))
     find_chain(one, chain)
-    for geometry in chain:
-        assert list(one.maps) == [geometry]
-        kept, link = one.maps[geometry], kernel_map(other, geometry)
+    for spec in chain:
+        assert list(one.maps) == [spec]
+        kept, link = one.maps[spec], kernel_map(other, spec)
         assert kept.target.shape == link.target.shape
-        assert kept.target.sorted_keys.equal(reference.find_targets(other, geometry))
+        assert kept.target.sorted_keys.equal(reference.find_targets(other, spec))
         one, other = kept.target, link.target
 
 
@@ -72,12 +72,12 @@ def test_a_level_too_large_for_a_map_is_sorted(monkeypatch):
 def test_voxel_query_equals_reference(density, reach, radius, samples):
     sites = sites_of(4, (5, 6, 20), density)
     size = torch.tensor([0.5, 0.4, 0.3], dtype=torch.float64, device=DEVICE)
-    centres = (sites.indices[:, 1:].flip(1) + 0.5) * size
+    centers = (sites.indices[:, 1:].flip(1) + 0.5) * size
     generator = torch.Generator().manual_seed(5)
     points = (torch.rand((70, 3), generator=generator, dtype=torch.float64).to(DEVICE) * 11 - 0.5) * size * 2
     sample = torch.randint(3, (70, 1), generator=generator).to(DEVICE)
     cells = torch.cat((sample, torch.floor(points / size).long().flip(1)), dim=1)
     least, most = torch.iinfo(torch.int64).min, torch.iinfo(torch.int64).max
     cells[:3] = torch.tensor([[0, least, least, least], [1, most, most, most], [most, 2, 2, 2]], device=DEVICE)
-    given = (points, cells, sites, centres, reach, radius, samples)
+    given = (points, cells, sites, centers, reach, radius, samples)
     assert voxel_query(*given).equal(plain_query.voxel_query(*given))

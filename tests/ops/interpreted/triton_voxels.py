@@ -29,15 +29,15 @@ def test_voxels_equal_reference(samples, limits, count, dtype):
     if samples == "mixed":
         sample = sample[torch.randperm(count, generator=torch.Generator().manual_seed(0)).to(DEVICE)]
     sample = {"one": sample * 0, "gaps": sample * 2 + 1}.get(samples, sample)
-    got, want = (run(points, sample, 7, GRID, *limits) for run in (gpu.voxelize, reference.voxelize))
+    actual, want = (run(points, sample, 7, GRID, *limits) for run in (gpu.voxelize, reference.voxelize))
     for name in ("points", "voxel", "count", "index"):
-        assert getattr(got, name).equal(getattr(want, name)), name
+        assert getattr(actual, name).equal(getattr(want, name)), name
 
 
 def test_where_all_points_lie_outside_and_columns_are_few():
     points = torch.full((9, 4), 1e3, device=DEVICE)[:, :3]  # rows of another step
-    got = gpu.voxelize(points, torch.zeros(9, dtype=torch.int64, device=DEVICE), 2, GRID, 5, 10)
-    assert len(got) == 0 and got.points.shape == (0, 3) and got.index.shape == (0, 4)
+    actual = gpu.voxelize(points, torch.zeros(9, dtype=torch.int64, device=DEVICE), 2, GRID, 5, 10)
+    assert len(actual) == 0 and actual.points.shape == (0, 3) and actual.index.shape == (0, 4)
 
 
 def test_gradients_reach_the_kept_points():

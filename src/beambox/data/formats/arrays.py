@@ -97,7 +97,9 @@ def array_columns(array: np.ndarray, where: str) -> Columns:
         hint = "; transpose it" if array.ndim == 2 and array.shape[0] in (3, 4, 5, 6) else ""
         raise BeamboxError(f"{where} must hold an array of shape (N, 3 or more), got {array.shape}{hint}")
     if array.shape[1] > 64:
-        raise BeamboxError(f"{where} must hold one point a row, got an array of shape {array.shape}; is it transposed?")
+        raise BeamboxError(
+            f"{where} must hold one point per row, got an array of shape {array.shape}; is it transposed?"
+        )
     names = ORDER + tuple(f"column {number}" for number in range(5, array.shape[1] + 1))
     return Columns(names[: array.shape[1]], [array[:, k] for k in range(array.shape[1])])
 
@@ -126,7 +128,7 @@ def _record_columns(array: np.ndarray, where: str) -> Columns:
         take(name, array[name])
     if not arrays:
         raise BeamboxError(f"{where} must hold columns of real numbers, got {', '.join(left_out)}")
-    notes = (f"left out what is not one real number a point: {', '.join(left_out)}",) if left_out else ()
+    notes = (f"left out what is not one real number per point: {', '.join(left_out)}",) if left_out else ()
     return Columns(tuple(names), arrays, notes)
 
 

@@ -68,5 +68,5 @@ def decode(path: Path, kind: str, read: Callable[[], T]) -> T:
         raise BeamboxError(f"{path} cannot be read: {error.strerror or error}") from None
     except Exception as error:  # the libraries raise nearly anything where the content is broken
         reason = " ".join(str(error).split())[:160]
-        told = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
-        raise BeamboxError(f"{path} is not a readable {kind}, or is damaged ({told})") from error
+        details = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
+        raise BeamboxError(f"{path} is not a readable {kind}, or is damaged ({details})") from error

@@ -48,7 +48,7 @@ def cloud_columns(cloud: Any, where: str) -> Columns:
 
 
 def _fields(cloud: Any, where: str, notes: list[str]) -> list[tuple[str, int, str]]:
-    """Return name, offset and number type of the fields that hold one number a point."""
+    """Return name, offset and number type of the fields that hold one number per point."""
     chosen: dict[str, tuple[str, int, str]] = {}
     offsets = sorted({int(field.offset) for field in cloud.fields})
     for field in cloud.fields:
@@ -58,10 +58,10 @@ def _fields(cloud: Any, where: str, notes: list[str]) -> list[tuple[str, int, st
             continue
         kind = NUMBERS.get(int(field.datatype))
         if kind is None:
-            told = f"the field {name!a} has datatype {field.datatype}, which is no number type (1 to 8)"
+            details = f"the field {name!a} has datatype {field.datatype}, which is no number type (1 to 8)"
             if position:
-                raise BeamboxError(f"{where}: {told}")
-            notes.append(f"{told}: left out")
+                raise BeamboxError(f"{where}: {details}")
+            notes.append(f"{details}: left out")
             continue
         following = next((one for one in offsets if one > field.offset), None)
         end = int(field.offset) + np.dtype(kind).itemsize * int(field.count)

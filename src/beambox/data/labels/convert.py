@@ -17,8 +17,8 @@ from beambox.data.box_files import (
     parse_kitti_boxes,
 )
 from beambox.data.kitti_text import format_labels, read_calibration
-from beambox.data.labels.catalogue import FORMATS, frame_name, read_labels, write_labels
-from beambox.data.labels.frames import LabelledFrame
+from beambox.data.labels.catalog import FORMATS, frame_name, read_labels, write_labels
+from beambox.data.labels.frames import LabeledFrame
 from beambox.geometry import Calibration
 from beambox.io import read_text, write_text
 from beambox.structures import Labels
@@ -39,7 +39,7 @@ def convert_labels(
     *,
     calib: Path | None = None,
     degrees: bool | None = None,
-) -> tuple[dict[str, LabelledFrame], list[str]]:
+) -> tuple[dict[str, LabeledFrame], list[str]]:
     """Read labels and write them in another format.
 
     Args:
@@ -75,7 +75,7 @@ def convert_labels(
     return frames, notes
 
 
-def heading_note(frames: Mapping[str, LabelledFrame]) -> str | None:
+def heading_note(frames: Mapping[str, LabeledFrame]) -> str | None:
     """Tell where most boxes are longer across than along their heading: axes or sizes are then probably swapped."""
     boxes = np.concatenate([frame.boxes for frame in frames.values()]) if frames else np.zeros((0, 7))
     large = boxes[np.maximum(boxes[:, 3], boxes[:, 4]) > 2.5]  # vehicles: nothing follows from what is nearly square
@@ -88,7 +88,7 @@ def heading_note(frames: Mapping[str, LabelledFrame]) -> str | None:
     )
 
 
-def _read_own(source: Path, kind: str, calib: Path | None) -> dict[str, LabelledFrame]:
+def _read_own(source: Path, kind: str, calib: Path | None) -> dict[str, LabeledFrame]:
     if not source.exists():
         raise MissingFileError(f"{source} is not there")
     if source.is_dir():
@@ -106,7 +106,7 @@ def _read_own(source: Path, kind: str, calib: Path | None) -> dict[str, Labelled
             found.update(parse_frames_file(text, kind, str(file)))
         else:
             found[name] = parse_box_file(text, kind, str(file))
-    return {name: LabelledFrame(one.names, one.boxes, (), one.places) for name, one in found.items()}
+    return {name: LabeledFrame(one.names, one.boxes, (), one.places) for name, one in found.items()}
 
 
 def _names_frames(text: str) -> bool:
@@ -119,8 +119,8 @@ def _calibration(calib: Path | None, name: str) -> Calibration:
     return read_calibration(calib / f"{name}.txt" if calib.is_dir() else calib)
 
 
-def _write_kitti(frames: Mapping[str, LabelledFrame], out: Path, calib: Path | None) -> None:
-    from beambox.data.labels.catalogue import check_part
+def _write_kitti(frames: Mapping[str, LabeledFrame], out: Path, calib: Path | None) -> None:
+    from beambox.data.labels.catalog import check_part
 
     for name, frame in frames.items():
         labels = Labels(torch.from_numpy(frame.boxes).float(), tuple("_".join(one.split()) for one in frame.names))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError
 
-__all__ = ["LabelledFrame", "Reader", "member", "vector", "wrap"]
+__all__ = ["LabeledFrame", "Reader", "member", "vector", "wrap"]
 
 Floats = NDArray[np.float64]
 TILT = 0.02
@@ -21,7 +21,7 @@ FARTHEST = 1e9
 
 
 @dataclass(frozen=True)
-class LabelledFrame:
+class LabeledFrame:
     """The boxes of one frame; N boxes."""
 
     names: tuple[str, ...]
@@ -85,7 +85,7 @@ class Reader:
         most = max((abs(wrap(math.radians(a) if self.degrees else a)) for a in angles), default=0.0)
         self._tilt = max(self._tilt, min(most, abs(math.pi - most)))
 
-    def result(self) -> dict[str, LabelledFrame]:
+    def result(self) -> dict[str, LabeledFrame]:
         """Return the frames.
 
         Raises:
@@ -105,10 +105,10 @@ class Reader:
         return {frame: self._frame(rows) for frame, rows in self._rows.items()}
 
     @staticmethod
-    def _frame(rows: Iterable[tuple[str, list[float], str, str]]) -> LabelledFrame:
+    def _frame(rows: Iterable[tuple[str, list[float], str, str]]) -> LabeledFrame:
         rows = list(rows)
         ids = tuple(identity for _, _, identity, _ in rows)
-        return LabelledFrame(
+        return LabeledFrame(
             tuple(name for name, _, _, _ in rows),
             np.array([values for _, values, _, _ in rows], dtype=np.float64).reshape(-1, 7),
             ids if any(ids) else (),
@@ -129,9 +129,11 @@ def member(value: Any, key: str, kind: type | tuple[type, ...], where: str) -> A
     """
     found = value.get(key) if isinstance(value, Mapping) else None
     if not isinstance(found, kind) or isinstance(found, bool):
-        told = {dict: "an object", list: "a list", str: "a text", float: "a number"}
+        type_names = {dict: "an object", list: "a list", str: "a text", float: "a number"}
         first = kind[0] if isinstance(kind, tuple) else kind
-        raise BeamboxError(f"{where}: expected {told.get(first, 'a value')} under the key `{key}`, got {found!r:.60}")
+        raise BeamboxError(
+            f"{where}: expected {type_names.get(first, 'a value')} under the key `{key}`, got {found!r:.60}"
+        )
     return found
 
 

@@ -1,4 +1,4 @@
-"""JSON label formats of annotation tools with one file a frame.
+"""JSON label formats of annotation tools with one file per frame.
 
 * SUSTechPOINTS (naurril/SUSTechPOINTS): a list of ``obj_type``, ``obj_id``, ``psr``: position, scale, rotation
   (radians).
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from beambox.checks import BeamboxError
-from beambox.data.labels.frames import LabelledFrame, Reader, member, vector
+from beambox.data.labels.frames import LabeledFrame, Reader, member, vector
 
 __all__ = [
     "format_labelcloud",
@@ -56,7 +56,7 @@ def parse_sustechpoints(content: Any, reader: Reader, frame: str) -> None:
         reader.add(frame, one.get("obj_type"), numbers, place, one.get("obj_id", ""))
 
 
-def format_sustechpoints(frame: LabelledFrame) -> Any:
+def format_sustechpoints(frame: LabeledFrame) -> Any:
     """Return the objects of one frame."""
     return [
         {
@@ -89,7 +89,7 @@ def parse_labelcloud(content: Any, reader: Reader, frame: str) -> None:
         reader.add(frame, one.get("name"), numbers, place)
 
 
-def format_labelcloud(frame: LabelledFrame, name: str, angle: Callable[[float], float] | None) -> Any:
+def format_labelcloud(frame: LabeledFrame, name: str, angle: Callable[[float], float] | None) -> Any:
     """Return the objects of one frame.
 
     Args:
@@ -141,7 +141,7 @@ def _figures(content: Any, reader: Reader, frame: str, begin: str, known: Mappin
         reader.add(frame, known[owner], numbers, place, owner)
 
 
-def format_supervisely(frame: LabelledFrame, name: str) -> Any:
+def format_supervisely(frame: LabeledFrame, name: str) -> Any:
     """Return the annotation of one point cloud; keys follow from its name and the identities."""
     objects, figures = [], []
     for k, (label, box, identity) in enumerate(zip(frame.names, frame.boxes.tolist(), frame.identities())):

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from beambox.checks import BeamboxError
-from beambox.data.labels.frames import LabelledFrame, Reader, member, vector, wrap
+from beambox.data.labels.frames import LabeledFrame, Reader, member, vector, wrap
 
 __all__ = [
     "format_datumaro",
@@ -31,7 +31,7 @@ __all__ = [
     "parse_segments",
 ]
 
-Frames = Mapping[str, LabelledFrame]
+Frames = Mapping[str, LabeledFrame]
 QUATERNION = ("qx", "qy", "qz", "qw")
 
 
@@ -242,7 +242,7 @@ def format_openlabel(frames: Frames) -> Any:
 
 
 def _heading(quaternion: list[float], reader: Reader, where: str) -> float:
-    """Return the heading that a quaternion gives the box's x axis, seen from above, in the file's own angles."""
+    """Return the heading that a quaternion gives the box's x axis, in BEV, in the file's own angles."""
     length = math.sqrt(sum(value * value for value in quaternion))
     if not 0.9 < length < 1.1:
         raise BeamboxError(f"{where}: a quaternion must have length 1, got {length:g}")

@@ -1,4 +1,4 @@
-"""Label formats of one line a box: OpenPCDet's and MMDetection3D's text, CSV with any usual names, PandaSet's columns.
+"""Label formats with a line per box: OpenPCDet's and MMDetection3D's text, CSV with usual names, PandaSet's columns.
 
 * OpenPCDet (docs/CUSTOM_DATASET_TUTORIAL.md): ``x y z dx dy dz heading name``, z at the center.
 * MMDetection3D (docs/en/advanced_guides/customize_dataset.md): ``x y z dx dy dz yaw name``; z is that of the bottom, as
@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterable, Mapping
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.labels.frames import LabelledFrame, Reader, wrap
+from beambox.data.labels.frames import LabeledFrame, Reader, wrap
 
 __all__ = ["format_csv", "format_pandaset", "format_text", "parse_csv", "parse_pandaset", "parse_text"]
 
@@ -89,7 +89,7 @@ def parse_text(text: str, reader: Reader, frame: str, *, bottom: bool = False) -
         reader.add(frame, " ".join(words[7:]), numbers, f"line {number}")
 
 
-def format_text(frame: LabelledFrame, *, bottom: bool = False) -> str:
+def format_text(frame: LabeledFrame, *, bottom: bool = False) -> str:
     """Write ``x y z dx dy dz yaw name``."""
     lines = []
     for name, box in zip(frame.names, frame.boxes.tolist()):
@@ -119,7 +119,7 @@ def parse_csv(text: str, reader: Reader, frame: str) -> None:
         reader.add(own, row[columns["name"]], numbers, f"line {number}", identity)
 
 
-def format_csv(frames: Mapping[str, LabelledFrame]) -> str:
+def format_csv(frames: Mapping[str, LabeledFrame]) -> str:
     """Write all frames as one table: frame, name, x, y, z, l, w, h, yaw, id. Frames without a box are not in it."""
     return _write(
         ("frame", "name", *NUMBERS, "id"),
@@ -152,7 +152,7 @@ def parse_pandaset(text: str, reader: Reader, frame: str) -> None:
         reader.add(frame, row[place["label"]], numbers, f"line {number}", row[place["uuid"]] if "uuid" in place else "")
 
 
-def format_pandaset(frame: LabelledFrame) -> str:
+def format_pandaset(frame: LabeledFrame) -> str:
     """Write the columns of PandaSet's devkit as CSV."""
     rows = []
     for name, box, identity in zip(frame.names, frame.boxes.tolist(), frame.identities()):

@@ -2,23 +2,23 @@
 
 from beambox.detectors.kassd.keypoints import ExtraPoint, KeypointLayout
 from beambox.detectors.kassd.network import (
+    KASSD,
     KamOptions,
     KamScore,
-    Kassd,
-    KassdConfig,
-    KassdPredictions,
+    KASSDConfig,
+    KASSDPredictions,
     LamReduce,
     Neck,
     kassd,
 )
 
 __all__ = [
+    "KASSD",
     "ExtraPoint",
+    "KASSDConfig",
+    "KASSDPredictions",
     "KamOptions",
     "KamScore",
-    "Kassd",
-    "KassdConfig",
-    "KassdPredictions",
     "KeypointLayout",
     "LamReduce",
     "Neck",

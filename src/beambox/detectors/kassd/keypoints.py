@@ -103,7 +103,7 @@ class KeypointLayout:
         return torch.tensor(points, dtype=torch.float64)
 
     def points(self, boxes: Tensor, anchors: Tensor) -> Tensor:
-        """Place the keypoints of boxes, seen from above (KASSD, equation 3, corrected; see ``docs/kassd.md``).
+        """Place the keypoints of boxes, in BEV (KASSD, equation 3, corrected; see ``docs/kassd.md``).
 
         Args:
             boxes: ``(N, 7)``; gradients flow to centres, sizes and yaw.

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from beambox.layers.bev import conv_bn_relu, deconv_bn_relu
 
-__all__ = ["DenseAspp", "PyramidAttention", "SpatialPyramidPooling"]
+__all__ = ["DenseASPP", "PyramidAttention", "SpatialPyramidPooling"]
 
 
 class SpatialPyramidPooling(nn.Module):
@@ -29,7 +29,7 @@ class SpatialPyramidPooling(nn.Module):
         return self.mix(torch.cat([bev, *(pool(bev) for pool in self.pools)], dim=1))
 
 
-class DenseAspp(nn.Module):
+class DenseASPP(nn.Module):
     """Dilated convolutions, each seeing all before it (Yang et al., CVPR 2018), of half the map's width inside."""
 
     def __init__(self, channels: int, dilations: Sequence[int] = (3, 6, 12, 18)) -> None:

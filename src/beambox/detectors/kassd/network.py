@@ -24,11 +24,11 @@ Where the paper is silent or contradicts itself (``docs/kassd.md`` tells each at
 * what KAM learns from, and what becomes of its score, are not told: focal loss, a box is right from 3-D IoU 0.7 on, the
   score replaces the class score (``kam_options.score`` multiply keeps both);
 * the loss weights (2, 1, 1, 0.2) are in the order class, box, keypoints, direction as printed; every relative of KASSD
-  has class 1, box 2: ``swapped``;
+  has class 1, box 2: ``swap_cls_loc_weights``;
 * smooth-L1 turns linear at 1/9, as in SECOND's code, not at 1 as printed (``smooth_l1_beta``);
 * learning rate, augmentation and post-processing are missing: those of SA-SSD, its nearest relative.
 
-Added: several classes, each with its own score maps; ``neck`` for the paper's table 5; ``centred_anchors``.
+Added: several classes, each with its own score maps; ``neck`` for the paper's table 5; ``centered_anchors``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from torch import Tensor, nn
 from beambox.checks import BeamboxError, choose_fields, chosen
 from beambox.detectors.contract import detections_from, expect_made, targets_from
 from beambox.detectors.kassd.keypoints import KeypointLayout, KeypointScores
-from beambox.detectors.kassd.necks import DenseAspp, PyramidAttention, SpatialPyramidPooling
+from beambox.detectors.kassd.necks import DenseASPP, PyramidAttention, SpatialPyramidPooling
 from beambox.detectors.second import KITTI_VOXELS, STRIDE
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS, AnchorClass, AnchorGrid
@@ -71,12 +71,12 @@ from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
 __all__ = [
+    "KASSD",
     "FeatureReuse",
+    "KASSDConfig",
+    "KASSDPredictions",
     "KamOptions",
     "KamScore",
-    "Kassd",
-    "KassdConfig",
-    "KassdPredictions",
     "LamReduce",
     "LocationAttention",
     "Neck",
@@ -132,7 +132,7 @@ class KamOptions:
     test_boxes: int = 2000
     """Boxes of a sample at test time, the best."""
     positive_iou: tuple[float, ...] = (0.7,)
-    """3-D overlap with an object of its class from which a box is right: one for all classes, or one a class."""
+    """3-D overlap with an object of its class from which a box is right: one for all classes, or one per class."""
     soft_targets: bool = False
     """Learn ``2 IoU - 0.5``, cut to [0, 1], instead of right or wrong."""
     box_gradient: bool = False
@@ -145,18 +145,18 @@ class KamOptions:
 
 
 @dataclass(frozen=True)
-class KassdConfig:
+class KASSDConfig:
     """Everything that defines the network; the defaults are the published KITTI setting, cars only."""
 
     anchors: tuple[AnchorClass, ...] = KITTI_ANCHORS[:1]
-    """One anchor shape a class; also the classes and their order (section 4.2)."""
+    """One anchor shape per class; also the classes and their order (section 4.2)."""
     grid: VoxelGrid = KITTI_VOXELS
     """Region and voxel size in metres (section 4.2: 0.05 x 0.05 x 0.1)."""
     max_points: int = 5
     """Points kept in a voxel, in scan order."""
     max_voxels: int | None = 40000
     """Voxels kept in a sweep, in order of first appearance; None keeps all."""
-    columns: int = 4
+    num_point_features: int = 4
     """Values of a point: x, y, z, intensity, ..."""
     absolute_xy: bool = True
     """Whether a voxel's mean x and y are told from the sensor; else from the voxel's centre."""
@@ -184,13 +184,13 @@ class KassdConfig:
     """Channels of the first two convolutions of the score maps."""
     kam_options: KamOptions = field(default_factory=KamOptions)
     """Which boxes are scored, and what is right."""
-    centred_anchors: bool = False
+    centered_anchors: bool = False
     """Whether anchors stand at the centres of the map's cells."""
     loss: LossWeights = field(default_factory=lambda: LossWeights(cls=2.0, loc=1.0, direction=0.2))
     """Weights of the head's losses (section 4.2: class 2, box 1, direction 0.2)."""
     keypoint_weight: float = 1.0
     """Weight of the keypoints' loss (section 4.2)."""
-    swapped: bool = False
+    swap_cls_loc_weights: bool = False
     """Exchange the weights of class and box: 1 and 2, as SECOND and SA-SSD have them."""
     smooth_l1_beta: float = 1 / 9
     """Where the regression loss turns linear."""
@@ -217,7 +217,7 @@ class KassdConfig:
     @property
     def loss_weights(self) -> LossWeights:
         """Weights of the head's losses as they are used."""
-        if not self.swapped:
+        if not self.swap_cls_loc_weights:
             return self.loss
         return LossWeights(self.loss.loc, self.loss.cls, self.loss.direction)
 
@@ -232,7 +232,7 @@ class Candidates:
     """``(N,)`` int64."""
     cls: Tensor
     """``(N,)`` the head's score of that class, in [0, 1]; 1 for labelled boxes."""
-    places: Tensor
+    anchor_xy: Tensor
     """``(N, 2)`` x, y of the anchors they come from; a labelled box is its own anchor."""
     sample: Tensor
     """``(N,)`` int64, ascending."""
@@ -243,7 +243,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class KassdPredictions:
+class KASSDPredictions:
     """What the network says of a batch."""
 
     head: AnchorPredictions
@@ -256,17 +256,17 @@ class KassdPredictions:
     """``(N,)`` what their keypoints say of them, logits."""
 
 
-class Kassd(nn.Module):
-    """The network; see :class:`KassdConfig`.
+class KASSD(nn.Module):
+    """The network; see :class:`KASSDConfig`.
 
-    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`KassdPredictions` over the map of stride 8.
+    ``model(batch)`` takes a :class:`Batch` of sweeps and returns :class:`KASSDPredictions` over the map of stride 8.
     """
 
-    def __init__(self, config: KassdConfig) -> None:
+    def __init__(self, config: KASSDConfig) -> None:
         super().__init__()
         self.config = config
-        self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE, config.centred_anchors)
-        self.encoder = VoxelEncoder(config.columns, config.encoder_widths, config.encoder_out)
+        self.anchors = AnchorGrid(config.anchors, config.grid, STRIDE, config.centered_anchors)
+        self.encoder = VoxelEncoder(config.num_point_features, config.encoder_widths, config.encoder_out)
         self.neck = make_neck(config, self.encoder.bev_channels(config.grid.shape[0]))
         self.head = AnchorHead(self.neck.out_channels, self.anchors)
         nn.init.normal_(self.head.cls.weight, std=0.01)  # behind LLM, default weights would spread the prior of 0.01
@@ -278,7 +278,7 @@ class Kassd(nn.Module):
 
     def forward(
         self, batch: Batch, grid: VoxelGrid | None = None, labels: Sequence[Labels] | None = None
-    ) -> KassdPredictions:
+    ) -> KASSDPredictions:
         """Predict over the configured region, or over ``grid``, which must have cells of the same size.
 
         With ``labels`` KAM scores the boxes it learns from, without those that may become detections.
@@ -289,11 +289,11 @@ class Kassd(nn.Module):
         bev = self.neck(stages.bev)  # (B, 128, ny / 8, nx / 8)
         head = self.head(bev, grid)
         if self.kam is None:
-            return KassdPredictions(head, None, None, None)
+            return KASSDPredictions(head, None, None, None)
         maps = self.kam(bev)  # (B, K, ny / 8, nx / 8)
         boxes = self.candidates(head, labels)  # N boxes
-        scores = self.kam.score(maps, grid, boxes.sample, boxes.boxes, boxes.classes, boxes.places)  # (N,)
-        return KassdPredictions(head, maps, boxes, scores)
+        scores = self.kam.score(maps, grid, boxes.sample, boxes.boxes, boxes.classes, boxes.anchor_xy)  # (N,)
+        return KASSDPredictions(head, maps, boxes, scores)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
@@ -303,10 +303,10 @@ class Kassd(nn.Module):
     def voxels(self, batch: Batch, grid: VoxelGrid) -> Voxels:
         """Gather points into voxels."""
         config = self.config
-        points = batch.points[:, : config.columns]
+        points = batch.points[:, : config.num_point_features]
         return voxelize(points, batch.sample, batch.size, grid, config.max_points, config.max_voxels)
 
-    def loss(self, predictions: KassdPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
+    def loss(self, predictions: KASSDPredictions, labels: Sequence[Labels]) -> dict[str, Tensor]:
         """Return the weighted losses ``cls``, ``loc``, ``direction`` and, with KAM, ``keypoints`` (equation 10).
 
         Objects of other classes are background.
@@ -326,11 +326,11 @@ class Kassd(nn.Module):
         expect_made(quality is not None, wanted=True)
         assert quality is not None
         least = quality.new_tensor(options.positive_iou).expand(len(self.config.anchors))[candidates.classes]
-        right = (quality >= least).float()
-        wanted = (2 * quality - 0.5).clamp(0, 1) if options.soft_targets else right
+        positive = (quality >= least).float()
+        wanted = (2 * quality - 0.5).clamp(0, 1) if options.soft_targets else positive
         focal = sigmoid_focal(scores.float(), wanted)  # (N,)
         of_sample = focal.new_zeros(batch_size).index_add(0, candidates.sample, focal)  # (B,)
-        count = right.new_zeros(batch_size).index_add(0, candidates.sample, right)  # (B,)
+        count = positive.new_zeros(batch_size).index_add(0, candidates.sample, positive)  # (B,)
         return (of_sample / count.clamp(min=1)).mean()
 
     def candidates(self, head: AnchorPredictions, labels: Sequence[Labels] | None) -> Candidates:
@@ -344,14 +344,14 @@ class Kassd(nn.Module):
         if labels is None:
             chosen = [self.best_boxes(head, sample, self.config.kam_options.test_boxes) for sample in of_samples]
         else:
-            objects, kinds = targets_from(labels, self.config.classes, head.cls.device)
-            chosen = [self.boxes_to_learn(head, sample, objects[sample], kinds[sample]) for sample in of_samples]
+            gt_boxes, class_ids = targets_from(labels, self.config.classes, head.cls.device)
+            chosen = [self.boxes_to_learn(head, sample, gt_boxes[sample], class_ids[sample]) for sample in of_samples]
         quality = None if labels is None else torch.cat([c.quality for c in chosen if c.quality is not None])
         return Candidates(
             torch.cat([c.boxes for c in chosen]),
             torch.cat([c.classes for c in chosen]),
             torch.cat([c.cls for c in chosen]),
-            torch.cat([c.places for c in chosen]),
+            torch.cat([c.anchor_xy for c in chosen]),
             torch.cat([c.sample for c in chosen]),
             quality,
         )
@@ -380,31 +380,31 @@ class Kassd(nn.Module):
         boxes = head.decoded_rows(sample, rows)
         return Candidates(boxes, classes, cls, head.anchors[rows, :2], torch.full_like(rows, sample), None)
 
-    def boxes_to_learn(self, head: AnchorPredictions, sample: int, objects: Tensor, kinds: Tensor) -> Candidates:
+    def boxes_to_learn(self, head: AnchorPredictions, sample: int, gt_boxes: Tensor, class_ids: Tensor) -> Candidates:
         """Return one sample's best boxes and its labelled ones, and how good they are.
 
         Args:
             head: predictions.
             sample: position in the batch.
-            objects: ``(M, 7)`` labelled boxes.
-            kinds: ``(M,)`` int64 classes.
+            gt_boxes: ``(M, 7)`` labelled boxes.
+            class_ids: ``(M,)`` int64 classes.
         """
         options = self.config.kam_options
         found = self.best_boxes(head, sample, options.train_boxes, options.train_least)
-        inside = head.grid.contains(objects)
-        labelled, their_classes = objects[inside], kinds[inside]
-        boxes = torch.cat((found.boxes if options.box_gradient else found.boxes.detach(), labelled))
+        inside = head.grid.contains(gt_boxes)
+        labeled, their_classes = gt_boxes[inside], class_ids[inside]
+        boxes = torch.cat((found.boxes if options.box_gradient else found.boxes.detach(), labeled))
         classes = torch.cat((found.classes, their_classes))
         return Candidates(
             boxes,
             classes,
-            torch.cat((found.cls, found.cls.new_ones(len(labelled)))),
-            torch.cat((found.places, labelled[:, :2])),
+            torch.cat((found.cls, found.cls.new_ones(len(labeled)))),
+            torch.cat((found.anchor_xy, labeled[:, :2])),
             torch.full_like(classes, sample),
-            best_overlap(boxes.detach(), classes, objects, kinds)[0],
+            best_overlap(boxes.detach(), classes, gt_boxes, class_ids)[0],
         )
 
-    def decode(self, predictions: KassdPredictions) -> list[Detections]:
+    def decode(self, predictions: KASSDPredictions) -> list[Detections]:
         """Return the detections of each sample, best first."""
         if predictions.candidates is None or predictions.scores is None:
             kept = select_boxes(predictions.head, self.config.post)
@@ -537,20 +537,20 @@ class LocationAttention(nn.Module):
         return location_attention(high, low, self.reduce) if self.lam else high + low
 
 
-def make_neck(config: KassdConfig, in_channels: int) -> LocationAttention | BevBackbone | PyramidAttention:
+def make_neck(config: KASSDConfig, in_channels: int) -> LocationAttention | BevBackbone | PyramidAttention:
     """Build what stands between encoder and head."""
     c = config.width
     if config.neck is Neck.SECOND or not config.llm:
         return BevBackbone(in_channels, (5, 5), (1, 2), (c, 2 * c), (1, 2), (2 * c, 2 * c))
     if config.neck is Neck.PSA:
         return PyramidAttention(in_channels, c)
-    contexts = {Neck.LLM: None, Neck.DENSEASPP: DenseAspp, Neck.SPP: SpatialPyramidPooling}
+    contexts = {Neck.LLM: None, Neck.DENSEASPP: DenseASPP, Neck.SPP: SpatialPyramidPooling}
     context = contexts[config.neck]
     return LocationAttention(
         in_channels, c, config.frs_reuse, config.lam, config.lam_reduce, None if context is None else context(2 * c)
     )
 
 
-def kassd(config: KassdConfig | None = None) -> Kassd:
+def kassd(config: KASSDConfig | None = None) -> KASSD:
     """Build KASSD; without a configuration, the published KITTI one for cars (3.6 M parameters)."""
-    return Kassd(config or KassdConfig())
+    return KASSD(config or KASSDConfig())

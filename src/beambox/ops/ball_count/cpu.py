@@ -1,6 +1,6 @@
 """How many voxels lie around each voxel, by counting the bits of columns (numba).
 
-A map seen from above holds one word a column, one bit a cell. In each column that the ball reaches, the cells within
+A map in BEV holds one word per column, one bit per cell. In each column that the ball reaches, the cells within
 reach are one ``and`` and one count of bits.
 """
 
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from beambox.ops.ball_count import reference
 from beambox.ops.ball_count.columns import ball_columns, extent, map_too_large, padding
-from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.jit import jit, parallel_for
 
 __all__ = ["ball_counts"]
 
@@ -44,7 +44,7 @@ def ball_counts(
 def _count_ball(ball: Any, cells: Any, place: Any, after: Any, tops: Any, width: int, out: Any) -> None:
     """Write the counts of one sample's voxels for one ball's columns."""
     steps, heights = ball[:, 0] * width + ball[:, 1], ball[:, 2].copy()  # offsets in the flat map
-    run_in_blocks(
+    parallel_for(
         lambda start, stop: _count(cells, place, after, tops[start:stop], width, steps, heights, out),
         len(tops),
         smallest=256,
@@ -96,7 +96,7 @@ def _count(cells, place, after, tops, width, steps, heights, out):
     height_of = np.empty(len(steps), np.int64)
     everything = np.uint64(0xFFFFFFFFFFFFFFFF)
     for top in tops:
-        centre = place[top, 2] * width + place[top, 3]
+        center = place[top, 2] * width + place[top, 3]
         row = top
         while row >= 0:
             out[row] = 0
@@ -104,7 +104,7 @@ def _count(cells, place, after, tops, width, steps, heights, out):
         for word in range(len(cells)):
             n = 0
             for k in range(len(steps)):  # without a branch: an empty word is overwritten by the next
-                found = cells[word, centre + steps[k]]
+                found = cells[word, center + steps[k]]
                 around[n], height_of[n] = found, heights[k]
                 n += found != 0
             row = top

@@ -70,7 +70,7 @@ def _count(cells, column, z, steps, heights, out, voxels, reach, words, map_size
     """Count for one block of voxels."""
     voxel = tl.program_id(0) * block + tl.arange(0, block)
     has = voxel < voxels
-    centre = tl.load(column + voxel, has, 0)
+    center = tl.load(column + voxel, has, 0)
     level = tl.load(z + voxel, has, 0)
     total = tl.zeros((block,), tl.int64)
     for word in range(words):
@@ -79,7 +79,7 @@ def _count(cells, column, z, steps, heights, out, voxels, reach, words, map_size
             low = tl.maximum(level - height - 64 * word, 0)
             high = tl.minimum(level + height - 64 * word, 63)
             some = has & (low <= high)
-            where = centre + tl.load(steps + k) + word * map_size
+            where = center + tl.load(steps + k) + word * map_size
             found = tl.load(cells + where, some, 0).to(tl.uint64, bitcast=True)
             # Shift out what lies above and below; never by 64, which would be undefined.
             found = found << tl.where(some, 63 - high, 0).to(tl.uint64)

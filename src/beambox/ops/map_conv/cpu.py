@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.jit import jit, parallel_for
 from beambox.ops.map_conv.kernel import Folded, Ground, MapKernel
 from beambox.ops.map_conv.packed import Packed
 from beambox.ops.map_conv.tiles import LANES, ROWS, WIDE, products, transform_input, transform_output
@@ -43,7 +43,7 @@ def map_conv(bev: Tensor, kernel: MapKernel, ground: Ground | None = None, out: 
     values, result = x.numpy(), y.numpy()
 
     def work(kernel: Callable[[int, int], None]) -> None:
-        run_in_blocks(kernel, len(cells), CHUNK)
+        parallel_for(kernel, len(cells), CHUNK)
 
     if packed.winograd is not None:
         panels = packed.winograd
@@ -67,11 +67,11 @@ def active_cells(x: Tensor, packed: Packed, base: tuple[int, ...], ground: Groun
     table, row, column = arrays(ground.given)
     bits = x.numpy().view(np.int32)
     lines = len(x) * x.shape[1]
-    run_in_blocks(lambda a, b: _differs(bits, table.view(np.int32), row, column, differs, a, b), lines, 16)
+    parallel_for(lambda a, b: _differs(bits, table.view(np.int32), row, column, differs, a, b), lines, 16)
     active = np.empty((len(x), *base), np.bool_)
     table, row, column = arrays(ground.answer)
     result = y.numpy()
-    run_in_blocks(
+    parallel_for(
         lambda a, b: _reach_and_fill(
             differs, packed.in_step, packed.low, packed.high, active, packed.out_step, table, row, column, result, a, b
         ),

@@ -38,7 +38,7 @@ def neighborhood_attention(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, window
 
     ``softmax(q . k / sqrt(d) + bias) . v``, the softmax over the window. At a border the window shifts inside and keeps
     its size, so the pixel is off its centre. The bias belongs to the offset from the pixel to its neighbour: row
-    ``r_neighbour - r + window - 1``, column likewise.
+    ``r_neighbor - r + window - 1``, column likewise.
 
     Args:
         q: ``(B, heads, H, W, d)`` queries, floating point.

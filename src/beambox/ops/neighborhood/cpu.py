@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from beambox.ops.dispatch import needs_gradient
-from beambox.ops.jit import jit, jit_sums, run_in_blocks
+from beambox.ops.jit import jit, jit_fastmath, parallel_for
 from beambox.ops.neighborhood.windows import queries_of, window_start
 
 __all__ = ["neighborhood_attention"]
@@ -38,30 +38,30 @@ class _Attention(torch.autograd.Function):
             arrays = (_flat(tensor) for tensor in (q, k, v))
             _attend(*arrays, bias.numpy(), rows, columns, window, first, last, _flat(weights), _flat(out))
 
-        run_in_blocks(attend, _rows(q))
+        parallel_for(attend, _rows(q))
         ctx.save_for_backward(q, k, v, bias, weights)
         ctx.window = window
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None, None]:
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None, None]:
         q, k, v, bias, weights = ctx.saved_tensors
-        window, gradient = ctx.window, gradient.contiguous()
-        dq, dk, dv, slopes = (torch.empty_like(tensor) for tensor in (q, k, v, weights))
+        window, grad_out = ctx.window, grad_out.contiguous()
+        dq, dk, dv, grad_logits = (torch.empty_like(tensor) for tensor in (q, k, v, weights))
         by_row = q.new_zeros(_rows(q), *bias.shape[1:]).numpy()  # the bias's gradient, before it is added over rows
         rows, columns = (queries_of(length, window).numpy() for length in q.shape[2:4])
 
         def to_queries(first: int, last: int) -> None:
-            arrays = (_flat(tensor) for tensor in (k, v, weights, gradient, dq, slopes))
+            arrays = (_flat(tensor) for tensor in (k, v, weights, grad_out, dq, grad_logits))
             _to_queries(*arrays, by_row, rows, columns, window, first, last)
 
         def to_keys(first: int, last: int) -> None:
-            arrays = (_flat(tensor) for tensor in (q, weights, gradient, slopes, dk, dv))
+            arrays = (_flat(tensor) for tensor in (q, weights, grad_out, grad_logits, dk, dv))
             _to_keys(*arrays, rows, columns, window, first, last)
 
-        run_in_blocks(to_queries, _rows(q))
-        run_in_blocks(to_keys, _rows(q))
+        parallel_for(to_queries, _rows(q))
+        parallel_for(to_keys, _rows(q))
         dbias = torch.zeros_like(bias)
         _add_rows(by_row, q.shape[2], dbias.numpy())
         return dq, dk, dv, dbias, None, None
@@ -76,7 +76,7 @@ def _flat(tensor: Tensor) -> np.ndarray:
     return tensor.flatten(0, 1).numpy()
 
 
-@jit_sums
+@jit_fastmath
 def _attend(q, k, v, bias, rows, columns, window, first, last, weights, out):
     """Attend for the pixels of rows ``first`` to ``last``, counted over all maps; keep weights if there is room."""
     height, width, depth = q.shape[1], q.shape[2], q.shape[3]
@@ -113,9 +113,9 @@ def _attend(q, k, v, bias, rows, columns, window, first, last, weights, out):
                 weights[image, i, j] = weight
 
 
-@jit_sums
-def _to_queries(k, v, weights, gradient, dq, slopes, by_row, rows, columns, window, first, last):
-    """Write the gradients of q and of the logits (``slopes``), and add those of the bias up over each row."""
+@jit_fastmath
+def _to_queries(k, v, weights, grad_out, dq, grad_logits, by_row, rows, columns, window, first, last):
+    """Write the gradients of q and of the logits (``grad_logits``), and add those of the bias up over each row."""
     height, width, depth = k.shape[1], k.shape[2], k.shape[3]
     scale = k.dtype.type(1 / np.sqrt(depth))
     for place in range(first, last):
@@ -129,23 +129,23 @@ def _to_queries(k, v, weights, gradient, dq, slopes, by_row, rows, columns, wind
                     n = r * window + c
                     dot = k.dtype.type(0)
                     for x in range(depth):
-                        dot += gradient[image, i, j, x] * v[image, top + r, left + c, x]
-                    slopes[image, i, j, n] = dot
+                        dot += grad_out[image, i, j, x] * v[image, top + r, left + c, x]
+                    grad_logits[image, i, j, n] = dot
                     mean += weights[image, i, j, n] * dot
             for x in range(depth):
                 dq[image, i, j, x] = 0
             for r in range(window):
                 for c in range(window):
                     n = r * window + c
-                    slope = weights[image, i, j, n] * (slopes[image, i, j, n] - mean)
-                    slopes[image, i, j, n] = slope
-                    by_row[place, top + r - i + window - 1, left + c - j + window - 1] += slope
+                    grad_logit = weights[image, i, j, n] * (grad_logits[image, i, j, n] - mean)
+                    grad_logits[image, i, j, n] = grad_logit
+                    by_row[place, top + r - i + window - 1, left + c - j + window - 1] += grad_logit
                     for x in range(depth):
-                        dq[image, i, j, x] += slope * scale * k[image, top + r, left + c, x]
+                        dq[image, i, j, x] += grad_logit * scale * k[image, top + r, left + c, x]
 
 
-@jit_sums
-def _to_keys(q, weights, gradient, slopes, dk, dv, rows, columns, window, first, last):
+@jit_fastmath
+def _to_keys(q, weights, grad_out, grad_logits, dk, dv, rows, columns, window, first, last):
     """Write the gradients of k and v: each pixel gathers from the queries whose window holds it."""
     height, width, depth = q.shape[1], q.shape[2], q.shape[3]
     scale = q.dtype.type(1 / np.sqrt(depth))
@@ -158,10 +158,10 @@ def _to_keys(q, weights, gradient, slopes, dk, dv, rows, columns, window, first,
             for i in range(rows[1, row], rows[2, row]):
                 for j in range(columns[1, column], columns[2, column]):
                     n = (row - rows[0, i]) * window + column - columns[0, j]
-                    share, slope = weights[image, i, j, n], slopes[image, i, j, n] * scale
+                    share, grad_logit = weights[image, i, j, n], grad_logits[image, i, j, n] * scale
                     for x in range(depth):
-                        dk[image, row, column, x] += slope * q[image, i, j, x]
-                        dv[image, row, column, x] += share * gradient[image, i, j, x]
+                        dk[image, row, column, x] += grad_logit * q[image, i, j, x]
+                        dv[image, row, column, x] += share * grad_out[image, i, j, x]
 
 
 @jit

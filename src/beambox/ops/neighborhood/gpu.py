@@ -47,19 +47,19 @@ class _Attention(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
         q, k, v, bias, out, log_total = ctx.saved_tensors
-        window, gradient = ctx.window, gradient.contiguous()
+        window, grad_out = ctx.window, grad_out.contiguous()
         dq, dk, dv = (torch.empty_like(tensor) for tensor in (q, k, v))
-        mean = (gradient.to(log_total.dtype) * out).sum(dim=4)  # (B, heads, H, W) of the weights' gradients
+        mean = (grad_out.to(log_total.dtype) * out).sum(dim=4)  # (B, heads, H, W) of the weights' gradients
         weights = log_total.new_zeros(*q.shape[:4], window, window)
-        slopes = torch.zeros_like(weights)  # the logits' gradients
+        grad_logits = torch.zeros_like(weights)  # the logits' gradients
         if q.numel():
             sizes = _sizes(q, window)
-            _to_queries[_grid(q)](q, k, v, bias, log_total, mean, gradient, weights, slopes, dq, *sizes)
+            _to_queries[_grid(q)](q, k, v, bias, log_total, mean, grad_out, weights, grad_logits, dq, *sizes)
             row_low, row_high = queries_of(q.shape[2], window, q.device)[1:].contiguous()
-            _to_keys[_grid(q)](q, weights, slopes, gradient, dk, dv, row_low, row_high, *sizes)
-        return dq, dk, dv, _bias_gradient(slopes, window).to(bias.dtype), None
+            _to_keys[_grid(q)](q, weights, grad_logits, grad_out, dk, dv, row_low, row_high, *sizes)
+        return dq, dk, dv, _bias_gradient(grad_logits, window).to(bias.dtype), None
 
 
 def _grid(q: Tensor) -> tuple[int, int]:
@@ -72,19 +72,21 @@ def _sizes(q: Tensor, window: int) -> tuple[int, int, int, int, int, int, int]:
     return heads, height, width, depth, window, BLOCK, triton.next_power_of_2(depth)
 
 
-def _bias_gradient(slopes: Tensor, window: int) -> Tensor:
+def _bias_gradient(grad_logits: Tensor, window: int) -> Tensor:
     """Add ``(B, heads, H, W, L, L)`` up by offset from query to neighbour: ``(heads, 2 L - 1, 2 L - 1)``.
 
     As products with tables of zeros and ones, which add in a fixed order, as atomics would not.
     """
 
     def offsets(length: int) -> Tensor:  # (length, L, 2 L - 1): 1 where neighbour n of a pixel has that offset
-        pixel = torch.arange(length, device=slopes.device)[:, None]
-        neighbour = window_start(length, window, slopes.device)[:, None] + torch.arange(window, device=slopes.device)
-        return torch.nn.functional.one_hot(neighbour - pixel + window - 1, 2 * window - 1).to(slopes.dtype)
+        pixel = torch.arange(length, device=grad_logits.device)[:, None]
+        neighbor = window_start(length, window, grad_logits.device)[:, None] + torch.arange(
+            window, device=grad_logits.device
+        )
+        return torch.nn.functional.one_hot(neighbor - pixel + window - 1, 2 * window - 1).to(grad_logits.dtype)
 
-    by_row = torch.einsum("bhijrc,irp->bhjcp", slopes, offsets(slopes.shape[2]))
-    return torch.einsum("bhjcp,jcs->hps", by_row, offsets(slopes.shape[3]))
+    by_row = torch.einsum("bhijrc,irp->bhjcp", grad_logits, offsets(grad_logits.shape[2]))
+    return torch.einsum("bhjcp,jcs->hps", by_row, offsets(grad_logits.shape[3]))
 
 
 @triton.jit
@@ -130,10 +132,10 @@ def _attend(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
 
 @triton.jit
 def _to_queries(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
-    q, k, v, bias, log_total, mean, gradient, weights, slopes, dq, heads, height, width, depth,
+    q, k, v, bias, log_total, mean, grad_out, weights, grad_logits, dq, heads, height, width, depth,
     window: tl.constexpr, block: tl.constexpr, deep: tl.constexpr,
 ):  # fmt: skip
-    """Write the weights again, the gradients of the logits (``slopes``) and of q for one stretch of one row."""
+    """Write the weights again, the gradients of the logits (``grad_logits``) and of q for one stretch of one row."""
     place = tl.program_id(0).to(tl.int64)
     image, i = place // height, place % height
     j = tl.program_id(1) * block + tl.arange(0, block)
@@ -145,7 +147,7 @@ def _to_queries(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     here = (place * width + j)[:, None] * depth + x
     kept = log_total.dtype.element_ty
     query = tl.load(q + here, real, 0.0).to(kept)
-    pull = tl.load(gradient + here, real, 0.0).to(kept)
+    grad = tl.load(grad_out + here, real, 0.0).to(kept)
     log_sum = tl.load(log_total + place * width + j, has, 0.0)
     average = tl.load(mean + place * width + j, has, 0.0)
     total = tl.zeros((block, deep), kept)
@@ -156,17 +158,17 @@ def _to_queries(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
             key = tl.load(k + near, real, 0.0).to(kept)
             logit = tl.sum(query * key, axis=1) + tl.load(table + offset, has, 0.0).to(kept)
             weight = tl.exp(logit - log_sum)
-            slope = weight * (tl.sum(pull * tl.load(v + near, real, 0.0).to(kept), axis=1) - average)
-            total += slope[:, None] * key
+            grad_logit = weight * (tl.sum(grad * tl.load(v + near, real, 0.0).to(kept), axis=1) - average)
+            total += grad_logit[:, None] * key
             cell = (place * width + j) * window * window + r * window + c
             tl.store(weights + cell, weight, has)
-            tl.store(slopes + cell, slope, has)
+            tl.store(grad_logits + cell, grad_logit, has)
     tl.store(dq + here, total, real)
 
 
 @triton.jit
 def _to_keys(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
-    q, weights, slopes, gradient, dk, dv, row_low, row_high, heads, height, width, depth,
+    q, weights, grad_logits, grad_out, dk, dv, row_low, row_high, heads, height, width, depth,
     window: tl.constexpr, block: tl.constexpr, deep: tl.constexpr,
 ):  # fmt: skip
     """Gather the gradients of k and v for one stretch of one row, from the queries whose window holds each pixel."""
@@ -186,10 +188,10 @@ def _to_keys(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
             sees = (column < width) & (j >= 0) & (j < width) & (beside >= 0) & (beside < window)
             query = (image * height + i) * width + j
             cell = query * window * window + (row - _start(i, height, window)) * window + beside
-            share, slope = tl.load(weights + cell, sees, 0.0), tl.load(slopes + cell, sees, 0.0)
+            share, grad_logit = tl.load(weights + cell, sees, 0.0), tl.load(grad_logits + cell, sees, 0.0)
             there, mask = query[:, None] * depth + x, sees[:, None] & (x < depth)
-            to_key += slope[:, None] * tl.load(q + there, mask, 0.0).to(kept)
-            to_value += share[:, None] * tl.load(gradient + there, mask, 0.0).to(kept)
+            to_key += grad_logit[:, None] * tl.load(q + there, mask, 0.0).to(kept)
+            to_value += share[:, None] * tl.load(grad_out + there, mask, 0.0).to(kept)
         i += 1
     here = (place * width + column)[:, None] * depth + x
     tl.store(dk + here, to_key, real)

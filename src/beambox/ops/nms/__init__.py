@@ -1,4 +1,4 @@
-"""Non-maximum suppression of rotated boxes seen from above."""
+"""Non-maximum suppression of rotated boxes in BEV."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The walk takes 64 candidates at a time. Within these, who stays is the one answer to "a candidate stays if none that
 stays before it overlaps it", found by asking again until nothing changes; the words of those that stay are then joined
-into what is gone. One program a sample, and the host waits for nothing.
+into what is gone. One program per sample, and the host waits for nothing.
 """
 
 # Triton turns a number given for a tl.constexpr into a constant, which type checkers do not know:

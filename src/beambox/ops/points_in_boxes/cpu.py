@@ -27,7 +27,7 @@ def points_in_boxes_mask(points: Tensor, boxes: Tensor) -> Tensor:
 
 
 def _prepare(boxes: Tensor) -> np.ndarray:
-    """Return one row a box: centre (3), half sizes with tolerance (3), cosine, sine, half extent in x and y."""
+    """Return one row per box: centre (3), half sizes with tolerance (3), cosine, sine, half extent in x and y."""
     boxes = boxes.double()
     half = boxes[:, 3:6] / 2 + TOLERANCE
     cos, sin = boxes[:, 6].cos(), boxes[:, 6].sin()

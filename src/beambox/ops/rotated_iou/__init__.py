@@ -1,4 +1,4 @@
-"""Overlap of rotated boxes, seen from above and in three dimensions."""
+"""Overlap of rotated boxes, in BEV and in three dimensions."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ AREA_BACKENDS = (
 
 
 def iou_bev(a: Tensor, b: Tensor) -> Tensor:
-    """Return the intersection over union of all pairs of boxes, seen from above.
+    """Return the intersection over union of all pairs of boxes, in BEV.
 
     Exact polygon clipping in float64. A box without area, or with a value that is not finite, has IoU 0 with every box.
     Differentiable with respect to both (by the reference version).
@@ -104,7 +104,7 @@ def iou_3d(a: Tensor, b: Tensor) -> Tensor:
 
 
 def intersection_bev(a: Tensor, b: Tensor) -> Tensor:
-    """Return the area in square metres shared by all pairs, seen from above; arguments as in :func:`iou_bev`."""
+    """Return the area in square metres shared by all pairs, in BEV; arguments as in :func:`iou_bev`."""
     _check(a, b)
     return choose("intersection_bev", AREA_BACKENDS, a, b)(a, b)
 

@@ -9,7 +9,7 @@ __all__ = ["prepare"]
 
 
 def prepare(boxes: Tensor) -> Tensor:
-    """Return one row a box: x, y, half length, half width, cosine, sine, radius, z, half height; ``(N, 9)`` float64.
+    """Return one row per box: x, y, half length, half width, cosine, sine, radius, z, half height; ``(N, 9)`` float64.
 
     A box with a value that is not finite becomes one without size.
     """

@@ -30,9 +30,9 @@ class _SegmentMax(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        out = torch.zeros(ctx.rows, gradient.shape[1], dtype=gradient.dtype)
-        _send_back(gradient.contiguous().numpy(), ctx.winner, out.numpy())
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor, None, None]:
+        out = torch.zeros(ctx.rows, grad_out.shape[1], dtype=grad_out.dtype)
+        _send_back(grad_out.contiguous().numpy(), ctx.winner, out.numpy())
         return out, None, None
 
 
@@ -50,9 +50,9 @@ def _largest(values, segment, out, winner):
 
 
 @jit
-def _send_back(gradient, winner, out):
+def _send_back(grad_out, winner, out):
     """Add each maximum's gradient (S, C) to the row that held it (K, C)."""
-    for s in range(len(gradient)):
-        for c in range(gradient.shape[1]):
+    for s in range(len(grad_out)):
+        for c in range(grad_out.shape[1]):
             if winner[s, c] >= 0:
-                out[winner[s, c], c] += gradient[s, c]
+                out[winner[s, c], c] += grad_out[s, c]

@@ -42,9 +42,9 @@ class _SegmentSum(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor, None, None]:
         (segment,) = ctx.saved_tensors
-        return gradient[segment], None, None
+        return grad_out[segment], None, None
 
 
 class _SegmentMax(torch.autograd.Function):
@@ -57,10 +57,10 @@ class _SegmentMax(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor, None, None]:
         (winner,) = ctx.saved_tensors
-        out = gradient.new_zeros(ctx.rows + 1, gradient.shape[1])  # the last row takes what empty segments send
-        return out.scatter(0, winner, gradient)[:-1], None, None
+        out = grad_out.new_zeros(ctx.rows + 1, grad_out.shape[1])  # the last row takes what empty segments send
+        return out.scatter(0, winner, grad_out)[:-1], None, None
 
 
 def _reduce(values: Tensor, segment: Tensor, size: int, largest: bool) -> tuple[Tensor, Tensor]:

@@ -11,11 +11,11 @@ from torch import Tensor
 from beambox.checks import BeamboxError, expect_shape
 from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose, pinned
 from beambox.ops.sparse_conv import reference
-from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple, linear_keys
+from beambox.ops.sparse_conv.sites import ConvSpec, KernelMap, Sites, Triple, linear_keys
 from beambox.ops.sparse_conv.tensor import SparseTensor
 
 __all__ = [
-    "Geometry",
+    "ConvSpec",
     "KernelMap",
     "Sites",
     "SparseTensor",
@@ -68,10 +68,10 @@ def _numba_targets() -> Callable[..., Tensor]:
 def _triton_targets() -> Callable[..., Tensor]:
     from beambox.ops.sparse_conv.gpu_maps import find_levels
 
-    def find_targets(sites: Sites, geometry: Geometry) -> Tensor:
-        if not _maps_fit(sites, (geometry,)):
-            return reference.find_targets(sites, geometry)
-        return find_levels(sites, (geometry,))[0].sorted_keys
+    def find_targets(sites: Sites, spec: ConvSpec) -> Tensor:
+        if not _maps_fit(sites, (spec,)):
+            return reference.find_targets(sites, spec)
+        return find_levels(sites, (spec,))[0].sorted_keys
 
     return find_targets
 
@@ -88,41 +88,41 @@ TARGET_BACKENDS = (
 )
 
 
-def kernel_map(sites: Sites, geometry: Geometry) -> KernelMap:
+def kernel_map(sites: Sites, spec: ConvSpec) -> KernelMap:
     """Return the map of a convolution from these sites, found once and kept with them."""
-    known = sites.maps.get(geometry)
+    known = sites.maps.get(spec)
     if known is not None:
         return known
-    if geometry.submanifold:
+    if spec.submanifold:
         target = sites
     else:
-        keys = choose("find_targets", TARGET_BACKENDS, sites.sorted_keys)(sites, geometry)
-        target = Sites.from_keys(keys, geometry.output_shape(sites.shape), sites.batch_size)
-    found = KernelMap(sites, target, geometry)
-    sites.maps[geometry] = found
+        keys = choose("find_targets", TARGET_BACKENDS, sites.sorted_keys)(sites, spec)
+        target = Sites.from_keys(keys, spec.output_shape(sites.shape), sites.batch_size)
+    found = KernelMap(sites, target, spec)
+    sites.maps[spec] = found
     return found
 
 
-def find_chain(sites: Sites, geometries: Sequence[Geometry]) -> None:
+def find_chain(sites: Sites, specs: Sequence[ConvSpec]) -> None:
     """Find the sites of a chain of strided convolutions together, where finding each by itself would wait for a GPU.
 
     They are kept with the sites they start from, as :func:`kernel_map` keeps them; elsewhere nothing is done.
     """
     one_by_one = can_run_triton(sites.sorted_keys) is not None or pinned() not in (None, "triton")
-    if one_by_one or not _maps_fit(sites, geometries) or geometries[0] in sites.maps:
+    if one_by_one or not _maps_fit(sites, specs) or specs[0] in sites.maps:
         return
     from beambox.ops.sparse_conv.gpu_maps import find_levels
 
-    for geometry, target in zip(geometries, find_levels(sites, geometries), strict=True):
-        sites.maps[geometry] = KernelMap(sites, target, geometry)
+    for spec, target in zip(specs, find_levels(sites, specs), strict=True):
+        sites.maps[spec] = KernelMap(sites, target, spec)
         sites = target
 
 
-def _maps_fit(sites: Sites, geometries: Sequence[Geometry]) -> bool:
+def _maps_fit(sites: Sites, specs: Sequence[ConvSpec]) -> bool:
     """Tell whether a byte for every cell of the levels is not too much."""
     shape = sites.shape
-    for geometry in geometries:
-        shape = geometry.output_shape(shape)
+    for spec in specs:
+        shape = spec.output_shape(shape)
         if sites.batch_size * math.prod(shape) > MOST_CELLS:
             return False
     return True
@@ -143,7 +143,7 @@ def submanifold_conv3d(
         A tensor at the sites of ``x`` equal to a dense convolution with "same" padding read at these sites.
     """
     _check_weight(x, weight)
-    found = kernel_map(x.sites, Geometry.centred(_kernel(weight), dilation))
+    found = kernel_map(x.sites, ConvSpec.centered(_kernel(weight), dilation))
     return SparseTensor(_convolve(x.features, weight, bias, found), found.target)
 
 
@@ -169,7 +169,7 @@ def sparse_conv3d(
         A tensor whose sites ascend in (b, z, y, x).
     """
     _check_weight(x, weight)
-    found = kernel_map(x.sites, Geometry(_kernel(weight), stride, padding, dilation))
+    found = kernel_map(x.sites, ConvSpec(_kernel(weight), stride, padding, dilation))
     return SparseTensor(_convolve(x.features, weight, bias, found), found.target)
 
 
@@ -200,7 +200,7 @@ def inverse_conv3d(
         BeamboxError: if ``x`` does not stand where that convolution would have put it.
     """
     _check_weight(x, weight)
-    found = kernel_map(onto, Geometry(_kernel(weight), stride, padding, dilation))
+    found = kernel_map(onto, ConvSpec(_kernel(weight), stride, padding, dilation))
     same = found.target is x.sites or (found.target.shape == x.shape and found.target.indices.equal(x.indices))
     if not same:
         raise BeamboxError(

@@ -13,22 +13,22 @@ from beambox.ops.sparse_conv.sites import KernelMap
 
 __all__ = ["convolve_with"]
 
-Multiply = Callable[[Tensor, Tensor, Tensor | None, KernelMap], Tensor]
+Forward = Callable[[Tensor, Tensor, Tensor | None, KernelMap], Tensor]
 """``(V_in, C_in), (K, C_in, C_out), (C_out,), pairs -> (V_out, C_out)``, without recording gradients."""
-Accumulate = Callable[[Tensor, Tensor, KernelMap], Tensor]
+WeightGrad = Callable[[Tensor, Tensor, KernelMap], Tensor]
 """``(V_in, C_in), (V_out, C_out), pairs -> (K, C_in, C_out)``: the weights' gradient."""
 
 
 def convolve_with(
-    multiply: Multiply,
-    accumulate: Accumulate,
+    forward: Forward,
+    weight_grad: WeightGrad,
     features: Tensor,
     weight: Tensor,
     bias: Tensor | None,
     pairs: KernelMap,
 ) -> Tensor:
     """Convolve differentiably, given one backend's two products."""
-    return _Convolution.apply(features, weight, bias, pairs, multiply, accumulate)
+    return _Convolution.apply(features, weight, bias, pairs, forward, weight_grad)
 
 
 class _Convolution(torch.autograd.Function):
@@ -39,12 +39,12 @@ class _Convolution(torch.autograd.Function):
         weight: Tensor,
         bias: Tensor | None,
         pairs: KernelMap,
-        multiply: Multiply,
-        accumulate: Accumulate,
+        forward: Forward,
+        weight_grad: WeightGrad,
     ) -> Tensor:
         ctx.save_for_backward(features, weight)
-        ctx.pairs, ctx.multiply, ctx.accumulate = pairs, multiply, accumulate
-        return multiply(features.detach(), weight.detach(), None if bias is None else bias.detach(), pairs)
+        ctx.pairs, ctx.forward, ctx.weight_grad = pairs, forward, weight_grad
+        return forward(features.detach(), weight.detach(), None if bias is None else bias.detach(), pairs)
 
     @staticmethod
     @once_differentiable
@@ -52,9 +52,9 @@ class _Convolution(torch.autograd.Function):
         features, weight = ctx.saved_tensors
         of_features = of_weight = of_bias = None
         if ctx.needs_input_grad[0]:
-            of_features = ctx.multiply(grad, weight.transpose(1, 2), None, ctx.pairs.inverse)
+            of_features = ctx.forward(grad, weight.transpose(1, 2), None, ctx.pairs.inverse)
         if ctx.needs_input_grad[1]:
-            of_weight = ctx.accumulate(features, grad, ctx.pairs)
+            of_weight = ctx.weight_grad(features, grad, ctx.pairs)
         if ctx.needs_input_grad[2]:
-            of_bias = grad.t().contiguous().sum(dim=1)  # one thread a channel, so that bits do not depend on threads
+            of_bias = grad.t().contiguous().sum(dim=1)  # one thread per channel, so that bits do not depend on threads
         return of_features, of_weight, of_bias, None, None, None

@@ -18,13 +18,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.jit import jit, parallel_for
 from beambox.ops.sparse_conv.autograd import convolve_with
 from beambox.ops.sparse_conv.cpu_maps import BLOCK, BlockPairs, block_pairs
 from beambox.ops.sparse_conv.sites import KernelMap
 from beambox.ops.sparse_conv.tiles import ROWS, VECTOR_BYTES, WIDE, multiply_rows, outer_products
 
-__all__ = ["accumulate", "convolve", "multiply"]
+__all__ = ["convolve", "forward", "weight_grad"]
 
 STRETCH = 4
 """Blocks laid side by side at a time in half precision."""
@@ -36,11 +36,11 @@ _outer_1, _outer_2, _outer_4 = (outer_products[n] for n in (1, 2, 4))
 def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Gather, multiply and add, as :func:`beambox.ops.sparse_conv.reference.convolve` defines it; differentiable."""
     if features.dtype in (torch.bfloat16, torch.float16):
-        return convolve_with(multiply_half, accumulate_half, features, weight, bias, pairs)
-    return convolve_with(multiply, accumulate, features, weight, bias, pairs)
+        return convolve_with(forward_half, weight_grad_half, features, weight, bias, pairs)
+    return convolve_with(forward, weight_grad, features, weight, bias, pairs)
 
 
-def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
+def forward(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Compute the convolution without recording gradients: ``(V_in, C_in)`` -> ``(V_out, C_out)``."""
     rows, c_out = len(pairs.target), weight.shape[2]
     blocks = pairs.kept(block_pairs)
@@ -48,46 +48,46 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
     start = _filled(features.new_zeros(c_out) if bias is None else bias).numpy()
     x, w, y = features.contiguous().numpy(), _filled(weight).contiguous().numpy(), out.numpy()
     source, target, order = blocks.source.reshape(-1), blocks.target.reshape(-1), pairs.target.order.numpy()
-    run_in_blocks(
-        lambda first, last: _multiply(x, w, start, source, target, order, blocks.count, y, first, last),
+    parallel_for(
+        lambda first, last: _forward(x, w, start, source, target, order, blocks.count, y, first, last),
         len(blocks.count),
     )
     return out[:rows, :c_out].contiguous()
 
 
-def accumulate(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
+def weight_grad(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
     """Compute the gradient of the weights: ``(K, C_in, C_out)``."""
     c_in, c_out = features.shape[1], grad.shape[1]
     blocks = pairs.kept(block_pairs)
     x = functional.pad(features, (0, -c_in % ROWS)).contiguous().numpy()
     g = _filled(grad).contiguous().numpy()
-    out = features.new_zeros((pairs.geometry.offsets, x.shape[1], g.shape[1]))
+    out = features.new_zeros((pairs.spec.offsets, x.shape[1], g.shape[1]))
     y, source, target = out.numpy(), blocks.source.reshape(-1), blocks.target.reshape(-1)
-    run_in_blocks(lambda first, last: _accumulate(x, g, source, target, blocks.count, y, first, last), len(out))
+    parallel_for(lambda first, last: _weight_grad(x, g, source, target, blocks.count, y, first, last), len(out))
     return out[:, :c_in, :c_out].contiguous()
 
 
-def multiply_half(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
+def forward_half(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Compute the convolution in half precision; each output row is one sum over K * C_in products."""
     order = pairs.target.order
     out = features.new_empty((len(order), weight.shape[2]))
     kernel = weight.reshape(-1, weight.shape[2])  # (K * C_in, C_out)
-    for start, laid in _side_by_side(features, pairs):
-        product = laid @ kernel if bias is None else torch.addmm(bias, laid, kernel)
-        out[order[start : start + len(laid)]] = product
+    for start, patches in _im2col(features, pairs):
+        product = patches @ kernel if bias is None else torch.addmm(bias, patches, kernel)
+        out[order[start : start + len(patches)]] = product
     return out
 
 
-def accumulate_half(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
+def weight_grad_half(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
     """Compute the gradient of the weights in half precision, summed in float32."""
     order = pairs.target.order
-    total = features.new_zeros((pairs.geometry.offsets * features.shape[1], grad.shape[1]), dtype=torch.float32)
-    for start, laid in _side_by_side(features, pairs):
-        total += laid.t() @ grad[order[start : start + len(laid)]]
+    total = features.new_zeros((pairs.spec.offsets * features.shape[1], grad.shape[1]), dtype=torch.float32)
+    for start, patches in _im2col(features, pairs):
+        total += patches.t() @ grad[order[start : start + len(patches)]]
     return total.reshape(-1, features.shape[1], grad.shape[1]).to(features.dtype)
 
 
-def _side_by_side(features: Tensor, pairs: KernelMap) -> Iterator[tuple[int, Tensor]]:
+def _im2col(features: Tensor, pairs: KernelMap) -> Iterator[tuple[int, Tensor]]:
     """Yield, for stretches of outputs in ascending order, the rows each sees: ``(rows, K * C_in)``, zero for none."""
     order, blocks = pairs.target.order, pairs.kept(block_pairs)
     place = torch.empty_like(order)
@@ -97,17 +97,19 @@ def _side_by_side(features: Tensor, pairs: KernelMap) -> Iterator[tuple[int, Ten
     for first in range(0, len(blocks.count), STRETCH):
         last = min(first + STRETCH, len(blocks.count))
         start = first * BLOCK
-        laid = torch.zeros((min(len(order), last * BLOCK) - start, width), dtype=features.dtype)
-        y = laid.view(torch.int16).numpy()
+        patches = torch.zeros((min(len(order), last * BLOCK) - start, width), dtype=features.dtype)
+        y = patches.view(torch.int16).numpy()
         if len(features):
-            run_in_blocks(_laying(x, blocks, place.numpy(), y, first, start), last - first)
-        yield start, laid
+            parallel_for(_im2col_blocks(x, blocks, place.numpy(), y, first, start), last - first)
+        yield start, patches
 
 
-def _laying(
+def _im2col_blocks(
     x: np.ndarray, blocks: BlockPairs, place: np.ndarray, y: np.ndarray, first: int, start: int
 ) -> Callable[[int, int], None]:
-    return lambda a, b: _lay(x, blocks.source, blocks.target, blocks.count, place, y, start, first + a, first + b)
+    return lambda a, b: _im2col_block(
+        x, blocks.source, blocks.target, blocks.count, place, y, start, first + a, first + b
+    )
 
 
 def _lanes(values: Tensor) -> int:
@@ -120,7 +122,7 @@ def _filled(values: Tensor) -> Tensor:
 
 
 @jit
-def _multiply(x, weight, start, source, target, order, count, out, first_block, last_block):
+def _forward(x, weight, start, source, target, order, count, out, first_block, last_block):
     """Fill a block's rows with ``start``, and the row that its incomplete tiles write to; then add the products."""
     offsets = weight.shape[0]
     lanes = VECTOR_BYTES // x.itemsize
@@ -150,7 +152,7 @@ def _multiply(x, weight, start, source, target, order, count, out, first_block, 
 
 
 @jit
-def _accumulate(x, grad, source, target, count, out, first_offset, last_offset):
+def _weight_grad(x, grad, source, target, count, out, first_offset, last_offset):
     lanes = VECTOR_BYTES // x.itemsize
     vectors = grad.shape[1] // lanes
     if count.size == 0:
@@ -177,11 +179,11 @@ def _accumulate(x, grad, source, target, count, out, first_offset, last_offset):
 
 
 @jit
-def _lay(x, source, target, count, place, laid, start, first_block, last_block):
+def _im2col_block(x, source, target, count, place, patches, start, first_block, last_block):
     channels = x.shape[1]
     for block in range(first_block, last_block):
         for k in range(count.shape[1]):
             for pair in range(count[block, k]):
                 row, at = source[block, k, pair], place[target[block, k, pair]] - start
                 for c in range(channels):
-                    laid[at, k * channels + c] = x[row, c]
+                    patches[at, k * channels + c] = x[row, c]

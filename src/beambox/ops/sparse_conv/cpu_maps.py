@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beambox.ops.jit import jit, run_in_blocks
-from beambox.ops.sparse_conv.sites import Geometry, KernelMap, Sites, Triple
+from beambox.ops.jit import jit, parallel_for
+from beambox.ops.sparse_conv.sites import ConvSpec, KernelMap, Sites, Triple
 from beambox.ops.sparse_conv.tiles import ROWS
 
 __all__ = ["BLOCK", "BlockPairs", "block_pairs", "find_pairs", "find_targets"]
@@ -31,17 +31,17 @@ class BlockPairs:
     and an output row of their own behind the last, one a block; places after these are undefined."""
 
 
-def axis_tables(geometry: Geometry, shape: Triple, out_shape: Triple, back: bool) -> tuple[np.ndarray, ...]:
+def axis_tables(spec: ConvSpec, shape: Triple, out_shape: Triple, back: bool) -> tuple[np.ndarray, ...]:
     """Tell, for each axis, where each kernel offset leads from each coordinate: ``(n, k)`` int64, -1 for nowhere.
 
     Args:
-        geometry: of the convolution.
+        spec: of the convolution.
         shape: extent of its input.
         out_shape: extent of its output.
         back: from inputs to outputs; else from outputs to inputs.
     """
     tables = []
-    sizes = zip(shape, out_shape, geometry.kernel, geometry.stride, geometry.padding, geometry.dilation)
+    sizes = zip(shape, out_shape, spec.kernel, spec.stride, spec.padding, spec.dilation)
     for n, m, kernel, stride, padding, dilation in sizes:
         offset = np.arange(kernel) * dilation - padding
         if back:
@@ -54,10 +54,10 @@ def axis_tables(geometry: Geometry, shape: Triple, out_shape: Triple, back: bool
     return tuple(tables)
 
 
-def find_targets(source: Sites, geometry: Geometry) -> Tensor:
+def find_targets(source: Sites, spec: ConvSpec) -> Tensor:
     """Return the ascending keys of every output whose receptive field holds an active input."""
-    shape, out_shape = source.shape, geometry.output_shape(source.shape)
-    z, y, x = axis_tables(geometry, shape, out_shape, back=True)
+    shape, out_shape = source.shape, spec.output_shape(source.shape)
+    z, y, x = axis_tables(spec, shape, out_shape, back=True)
     found = _reached(source.sorted_keys.numpy(), np.array(shape), np.array(out_shape), z, y, x)
     found.sort()
     fresh = np.ones(len(found), dtype=bool)
@@ -97,26 +97,26 @@ def _reached(keys, shape, out_shape, z_table, y_table, x_table):
 
 def block_pairs(pairs: KernelMap) -> BlockPairs:
     """Build a map's pairs grouped as the CPU works on them; to be kept with the map: ``pairs.kept(block_pairs)``."""
-    return find_pairs(pairs.source, pairs.target, pairs.geometry, pairs.mirror is not None)
+    return find_pairs(pairs.source, pairs.target, pairs.spec, pairs.inverse_of is not None)
 
 
-def find_pairs(source: Sites, target: Sites, geometry: Geometry, back: bool) -> BlockPairs:
+def find_pairs(source: Sites, target: Sites, spec: ConvSpec, back: bool) -> BlockPairs:
     """Find which input row reaches each output row through each kernel offset.
 
     Args:
         source: the sites that are read.
         target: the sites that are written.
-        geometry: of the convolution.
+        spec: of the convolution.
         back: whether the convolution runs from ``target`` to ``source``, and this is its inverse.
     """
     blocks = -(-len(target) // BLOCK)
     pairs = BlockPairs(
-        np.empty((blocks, geometry.offsets, BLOCK), np.int32),
-        np.empty((blocks, geometry.offsets, BLOCK), np.int32),
-        np.zeros((blocks, geometry.offsets), np.int32),
+        np.empty((blocks, spec.offsets, BLOCK), np.int32),
+        np.empty((blocks, spec.offsets, BLOCK), np.int32),
+        np.zeros((blocks, spec.offsets), np.int32),
     )
     shapes = (target.shape, source.shape) if back else (source.shape, target.shape)
-    tables = axis_tables(geometry, *shapes, back)
+    tables = axis_tables(spec, *shapes, back)
     keys, order = source.sorted_keys.numpy(), source.order.numpy()
     out_keys, out_order = target.sorted_keys.numpy(), target.order.numpy()
     extents = np.array((source.shape, target.shape))
@@ -126,7 +126,7 @@ def find_pairs(source: Sites, target: Sites, geometry: Geometry, back: bool) -> 
             keys, order, out_keys, out_order, extents, tables, pairs.source, pairs.target, pairs.count, first, last
         )
 
-    run_in_blocks(find, blocks, 16)
+    parallel_for(find, blocks, 16)
     return pairs
 
 

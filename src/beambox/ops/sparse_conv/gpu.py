@@ -18,7 +18,7 @@ from beambox.ops.sparse_conv.autograd import convolve_with
 from beambox.ops.sparse_conv.pairs import input_rows
 from beambox.ops.sparse_conv.sites import KernelMap
 
-__all__ = ["accumulate", "convolve", "multiply"]
+__all__ = ["convolve", "forward", "weight_grad"]
 
 ROWS = 64
 """Output rows of a program."""
@@ -28,7 +28,7 @@ STRETCHES = 16
 
 def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Gather, multiply and add, as :func:`beambox.ops.sparse_conv.reference.convolve` defines it; differentiable."""
-    return convolve_with(multiply, accumulate, features, weight, bias, pairs)
+    return convolve_with(forward, weight_grad, features, weight, bias, pairs)
 
 
 def _width(channels: int) -> int:
@@ -36,7 +36,7 @@ def _width(channels: int) -> int:
     return min(64, max(16, triton.next_power_of_2(channels)))
 
 
-def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
+def forward(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:
     """Compute the convolution without recording gradients: ``(V_in, C_in)`` -> ``(V_out, C_out)``."""
     table = pairs.kept(input_rows)
     rows, offsets = table.shape
@@ -45,7 +45,7 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
     if rows == 0:
         return out
     grid = (triton.cdiv(rows, ROWS), triton.cdiv(c_out, _width(c_out)))
-    _multiply[grid](
+    _forward[grid](
         features.contiguous(),
         weight.contiguous(),
         None if bias is None else bias.contiguous(),
@@ -62,7 +62,7 @@ def multiply(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: Kerne
     return out
 
 
-def accumulate(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
+def weight_grad(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
     """Compute the gradient of the weights: ``(K, C_in, C_out)``."""
     table = pairs.kept(input_rows)
     rows, offsets = table.shape
@@ -73,7 +73,7 @@ def accumulate(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
     stretches = triton.cdiv(rows, stretch)
     parts = torch.empty((stretches, offsets, c_in, c_out), dtype=torch.float32, device=features.device)
     tiles = triton.cdiv(c_in, _width(c_in)), triton.cdiv(c_out, _width(c_out))
-    _accumulate[(stretches * offsets, *tiles)](
+    _weight_grad[(stretches * offsets, *tiles)](
         features.contiguous(),
         grad.contiguous(),
         table,
@@ -91,7 +91,7 @@ def accumulate(features: Tensor, grad: Tensor, pairs: KernelMap) -> Tensor:
 
 
 @triton.jit
-def _multiply(
+def _forward(
     features,
     weight,
     bias,
@@ -133,7 +133,7 @@ def _multiply(
 
 
 @triton.jit
-def _accumulate(
+def _weight_grad(
     features,
     grad,
     table,

@@ -15,22 +15,22 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from beambox.ops.sparse_conv.sites import Geometry, Sites
+from beambox.ops.sparse_conv.sites import ConvSpec, Sites
 
-__all__ = ["find_levels", "inverse_table", "neighbour_table"]
+__all__ = ["find_levels", "inverse_table", "neighbor_table"]
 
 BLOCK = 128
 
 
-def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
-    """Find the input row that reaches each output through each offset; see ``reference.neighbour_table``."""
-    rows, offsets = len(target), geometry.offsets
+def neighbor_table(source: Sites, target: Sites, spec: ConvSpec) -> Tensor:
+    """Find the input row that reaches each output through each offset; see ``reference.neighbor_table``."""
+    rows, offsets = len(target), spec.offsets
     table = torch.empty((rows, offsets), dtype=torch.int32, device=source.sorted_keys.device)
     if rows:
         _look_up[(triton.cdiv(rows, BLOCK), offsets)](
             source.sorted_keys, source.order, target.sorted_keys, target.order, table, rows, len(source),
-            len(source).bit_length(), *target.shape, *source.shape, offsets, *geometry.kernel[1:], *geometry.stride,
-            *geometry.padding, *geometry.dilation, BLOCK,
+            len(source).bit_length(), *target.shape, *source.shape, offsets, *spec.kernel[1:], *spec.stride,
+            *spec.padding, *spec.dilation, BLOCK,
         )  # fmt: skip
     return table
 
@@ -43,18 +43,18 @@ def inverse_table(forward: Tensor, rows: int) -> Tensor:
     return back
 
 
-def find_levels(source: Sites, geometries: Sequence[Geometry]) -> list[Sites]:
+def find_levels(source: Sites, specs: Sequence[ConvSpec]) -> list[Sites]:
     """Return the sites after each of a chain of strided convolutions; the host waits once."""
     device, batch = source.sorted_keys.device, source.batch_size
     maps, shapes, shape = [], [], source.shape
-    for geometry in geometries:
-        before, shape = shape, geometry.output_shape(shape)
+    for spec in specs:
+        before, shape = shape, spec.output_shape(shape)
         active = torch.zeros(batch * math.prod(shape), dtype=torch.int8, device=device)
         count = len(source) if not maps else maps[-1].numel()
         if count:
             _spread[(triton.cdiv(count, BLOCK),)](
                 source.sorted_keys if not maps else maps[-1], active, count, not maps, *before, *shape,
-                *geometry.kernel, *geometry.stride, *geometry.padding, *geometry.dilation, BLOCK,
+                *spec.kernel, *spec.stride, *spec.padding, *spec.dilation, BLOCK,
             )  # fmt: skip
         maps.append(active)
         shapes.append(shape)

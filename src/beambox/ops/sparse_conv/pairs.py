@@ -14,9 +14,9 @@ __all__ = ["input_rows"]
 
 
 def _triton_table() -> Callable[..., Tensor]:
-    from beambox.ops.sparse_conv.gpu_maps import neighbour_table
+    from beambox.ops.sparse_conv.gpu_maps import neighbor_table
 
-    return neighbour_table
+    return neighbor_table
 
 
 def _triton_inverse() -> Callable[..., Tensor]:
@@ -27,7 +27,7 @@ def _triton_inverse() -> Callable[..., Tensor]:
 
 TABLE_BACKENDS = (
     Backend("triton", can_run_triton, _triton_table),
-    Backend("reference", always, lambda: reference_maps.neighbour_table),
+    Backend("reference", always, lambda: reference_maps.neighbor_table),
 )
 INVERSE_BACKENDS = (
     Backend("triton", can_run_triton, _triton_inverse),
@@ -40,10 +40,10 @@ def input_rows(pairs: KernelMap) -> Tensor:
 
     To be kept with the map: ``pairs.kept(input_rows)``.
     """
-    if pairs.mirror is None:
+    if pairs.inverse_of is None:
         look_up = choose("neighbour_table", TABLE_BACKENDS, pairs.source.sorted_keys)
-        return look_up(pairs.source, pairs.target, pairs.geometry)
-    forward = pairs.mirror.kept(input_rows)
-    if pairs.geometry.submanifold:
+        return look_up(pairs.source, pairs.target, pairs.spec)
+    forward = pairs.inverse_of.kept(input_rows)
+    if pairs.spec.submanifold:
         return forward.flip(1).contiguous()  # a centred kernel mirrors itself
     return choose("inverse_table", INVERSE_BACKENDS, forward)(forward, len(pairs.target))

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from beambox.ops.sparse_conv.pairs import input_rows
-from beambox.ops.sparse_conv.reference_maps import find_targets, inverse_table, neighbour_table
+from beambox.ops.sparse_conv.reference_maps import find_targets, inverse_table, neighbor_table
 from beambox.ops.sparse_conv.sites import KernelMap
 
-__all__ = ["convolve", "find_targets", "inverse_table", "neighbour_table"]
+__all__ = ["convolve", "find_targets", "inverse_table", "neighbor_table"]
 
 
 def convolve(features: Tensor, weight: Tensor, bias: Tensor | None, pairs: KernelMap) -> Tensor:

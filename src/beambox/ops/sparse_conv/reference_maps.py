@@ -5,37 +5,37 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from beambox.ops.sparse_conv.sites import Geometry, Sites, linear_keys
+from beambox.ops.sparse_conv.sites import ConvSpec, Sites, linear_keys
 
-__all__ = ["find_targets", "inverse_table", "neighbour_table"]
+__all__ = ["find_targets", "inverse_table", "neighbor_table"]
 
 
-def find_targets(source: Sites, geometry: Geometry) -> Tensor:
+def find_targets(source: Sites, spec: ConvSpec) -> Tensor:
     """Return the ascending keys of every output whose receptive field holds an active input."""
-    shape = geometry.output_shape(source.shape)
-    stride = torch.tensor(geometry.stride, device=source.indices.device)
+    shape = spec.output_shape(source.shape)
+    stride = torch.tensor(spec.stride, device=source.indices.device)
     extent = torch.tensor(shape, device=source.indices.device)
-    scaled = source.indices[:, None, 1:] - geometry.offset_table(source.indices.device)  # (V, K, 3) output * stride
+    scaled = source.indices[:, None, 1:] - spec.offset_table(source.indices.device)  # (V, K, 3) output * stride
     place = scaled // stride
     lands = ((scaled % stride == 0) & (place >= 0) & (place < extent)).all(dim=-1)  # (V, K)
     batch = source.indices[:, None, :1].expand(-1, place.shape[1], 1)
     return torch.unique(linear_keys(torch.cat((batch, place), dim=-1)[lands], shape))
 
 
-def neighbour_table(source: Sites, target: Sites, geometry: Geometry) -> Tensor:
+def neighbor_table(source: Sites, target: Sites, spec: ConvSpec) -> Tensor:
     """Find the input row that reaches each output through each kernel offset.
 
     Returns:
         ``(V_out, K)`` int32, -1 where no active site lies there.
     """
     device = source.indices.device
-    table = torch.full((len(target), geometry.offsets), -1, dtype=torch.int32, device=device)
+    table = torch.full((len(target), spec.offsets), -1, dtype=torch.int32, device=device)
     if len(source) == 0:
         return table
     extent = torch.tensor(source.shape, device=device)
-    centre = target.indices[:, 1:] * torch.tensor(geometry.stride, device=device)  # (V_out, 3)
-    for k, offset in enumerate(geometry.offset_table(device)):
-        place = centre + offset
+    center = target.indices[:, 1:] * torch.tensor(spec.stride, device=device)  # (V_out, 3)
+    for k, offset in enumerate(spec.offset_table(device)):
+        place = center + offset
         inside = ((place >= 0) & (place < extent)).all(dim=1)  # (V_out,)
         key = linear_keys(torch.cat((target.indices[:, :1], place), dim=1), source.shape)
         slot = torch.searchsorted(source.sorted_keys, key).clamp_(max=len(source) - 1)

@@ -14,14 +14,14 @@ from torch import Tensor
 from beambox.checks import BeamboxError, expect_shape
 from beambox.ops.dispatch import Backend, always, can_run_triton, choose
 
-__all__ = ["Geometry", "KernelMap", "Sites", "Triple"]
+__all__ = ["ConvSpec", "KernelMap", "Sites", "Triple"]
 
 Triple = tuple[int, int, int]
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Geometry:
+class ConvSpec:
     """Kernel size, stride, padding and dilation of a convolution, each (z, y, x)."""
 
     kernel: Triple
@@ -42,7 +42,7 @@ class Geometry:
                 raise BeamboxError(f"`{name}` must be three integers (z, y, x) of at least {least}, got {values}")
 
     @classmethod
-    def centred(cls, kernel: Triple, dilation: Triple = (1, 1, 1)) -> Geometry:
+    def centered(cls, kernel: Triple, dilation: Triple = (1, 1, 1)) -> ConvSpec:
         """Return the geometry of a submanifold convolution.
 
         Raises:
@@ -111,9 +111,9 @@ class KernelMap:
     """The ``V_in`` input sites."""
     target: Sites
     """The ``V_out`` output sites."""
-    geometry: Geometry
+    spec: ConvSpec
     """Of the convolution, or of the one that this map inverts."""
-    mirror: KernelMap | None = None
+    inverse_of: KernelMap | None = None
     """The map of which this one is the inverse, if it is one."""
     built: dict[Callable[[KernelMap], Any], Any] = field(default_factory=dict, repr=False)
     """What backends have built from it."""
@@ -121,7 +121,7 @@ class KernelMap:
     @cached_property
     def inverse(self) -> KernelMap:
         """The same pairs read from output to input: the map of the transposed convolution and of gradients."""
-        return self.mirror or KernelMap(self.target, self.source, self.geometry, self)
+        return self.inverse_of or KernelMap(self.target, self.source, self.spec, self)
 
     def kept(self, build: Callable[[KernelMap], T]) -> T:
         """Return what a backend builds from this map, such as a table of rows; built once and kept with the map."""
@@ -145,7 +145,7 @@ class Sites:
     """Spatial extent (z, y, x) in cells."""
     batch_size: int
     """Number of samples; some may be empty."""
-    maps: dict[Geometry, KernelMap] = field(default_factory=dict, repr=False)
+    maps: dict[ConvSpec, KernelMap] = field(default_factory=dict, repr=False)
     """Kernel maps found so far."""
 
     @cached_property

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beambox.ops.jit import jit, run_in_blocks
+from beambox.ops.jit import jit, parallel_for
 from beambox.ops.sparse_conv import Sites, Triple
 
 __all__ = ["pooled_query", "voxel_query"]
@@ -19,7 +19,7 @@ class _Query(NamedTuple):
 
     points: np.ndarray
     cells: np.ndarray
-    centres: np.ndarray
+    centers: np.ndarray
     lines: np.ndarray
     """Where the voxels of each line along x begin, in ascending order of keys."""
     column: np.ndarray
@@ -28,31 +28,33 @@ class _Query(NamedTuple):
     """``(V,)`` row of each."""
     extent: np.ndarray
     """Samples, z, y, x of the grid."""
-    reach: np.ndarray
+    query_range: np.ndarray
     limit: float
     """Largest squared distance."""
 
 
-def _prepared(points: Tensor, cells: Tensor, sites: Sites, centres: Tensor, reach: Triple, radius: float) -> _Query:
+def _prepared(
+    points: Tensor, cells: Tensor, sites: Sites, centers: Tensor, query_range: Triple, radius: float
+) -> _Query:
     keys = sites.sorted_keys.numpy()
     line = keys // sites.shape[2]
     lines = np.zeros(sites.batch_size * sites.shape[0] * sites.shape[1] + 1, np.int64)
     np.cumsum(np.bincount(line, minlength=len(lines) - 1), out=lines[1:])
-    p, c, m = points.contiguous().numpy(), cells.contiguous().numpy(), centres.contiguous().numpy()
+    p, c, m = points.contiguous().numpy(), cells.contiguous().numpy(), centers.contiguous().numpy()
     extent = np.array((sites.batch_size, *sites.shape))
     column, limit = keys - line * sites.shape[2], p.dtype.type(radius) ** 2
-    return _Query(p, c, m, lines, column, sites.order.numpy(), extent, np.array(reach), limit)
+    return _Query(p, c, m, lines, column, sites.order.numpy(), extent, np.array(query_range), limit)
 
 
 def voxel_query(
-    points: Tensor, cells: Tensor, sites: Sites, centres: Tensor, reach: Triple, radius: float, samples: int
+    points: Tensor, cells: Tensor, sites: Sites, centers: Tensor, query_range: Triple, radius: float, max_samples: int
 ) -> Tensor:
     """Find the first active voxels around each point; see :func:`beambox.ops.voxel_query.voxel_query`."""
-    found = np.full((len(points), samples), -1, np.int64)
+    found = np.full((len(points), max_samples), -1, np.int64)
     if len(sites) == 0 or len(points) == 0:
         return torch.from_numpy(found)
-    query = _prepared(points, cells, sites, centres, reach, radius)
-    run_in_blocks(lambda first, last: _search(query, found, first, last), len(points), 256)
+    query = _prepared(points, cells, sites, centers, query_range, radius)
+    parallel_for(lambda first, last: _search(query, found, first, last), len(points), 256)
     return torch.from_numpy(found)
 
 
@@ -60,10 +62,10 @@ def pooled_query(
     points: Tensor,
     cells: Tensor,
     sites: Sites,
-    centres: Tensor,
-    reach: Triple,
+    centers: Tensor,
+    query_range: Triple,
     radius: float,
-    samples: int,
+    max_samples: int,
     features: Tensor,
     weight: Tensor,
     bias: Tensor,
@@ -71,40 +73,40 @@ def pooled_query(
     """Pool what is found as it is found; see :func:`beambox.ops.voxel_query.pooled_query`."""
     if len(sites) == 0 or len(points) == 0:
         return torch.relu(bias).expand(len(points), -1).contiguous()
-    query = _prepared(points, cells, sites, centres, reach, radius)
+    query = _prepared(points, cells, sites, centers, query_range, radius)
     out = torch.empty(len(points), len(bias))
     values, result = features.contiguous().numpy(), out.numpy()
     slopes, shift = weight.t().contiguous().numpy(), bias.contiguous().numpy()
-    run_in_blocks(lambda a, b: _pool(query, samples, values, slopes, shift, result, a, b), len(points), 256)
+    parallel_for(lambda a, b: _pool(query, max_samples, values, slopes, shift, result, a, b), len(points), 256)
     return out
 
 
 @jit
 def _near(query, i, near):
     """Write the rows that a point finds to ``near``; return how many there are."""
-    cells, extent, reach, order, column = query.cells, query.extent, query.reach, query.order, query.column
-    points, centres, lines = query.points, query.centres, query.lines
+    cells, extent, query_range, order, column = query.cells, query.extent, query.query_range, query.order, query.column
+    points, centers, lines = query.points, query.centers, query.lines
     b, z, y, x = cells[i]
     if b < 0 or b >= extent[0]:
         return 0
     # out of reach of the grid; the indices may be any, so nothing may be added to them before this is known
-    if z < -reach[0] or y < -reach[1] or x < -reach[2]:
+    if z < -query_range[0] or y < -query_range[1] or x < -query_range[2]:
         return 0
-    if z - extent[1] >= reach[0] or y - extent[2] >= reach[1] or x - extent[3] >= reach[2]:
+    if z - extent[1] >= query_range[0] or y - extent[2] >= query_range[1] or x - extent[3] >= query_range[2]:
         return 0
     n = 0
-    for cz in range(max(0, z - reach[0]), min(extent[1], z + reach[0] + 1)):
-        for cy in range(max(0, y - reach[1]), min(extent[2], y + reach[1] + 1)):
+    for cz in range(max(0, z - query_range[0]), min(extent[1], z + query_range[0] + 1)):
+        for cy in range(max(0, y - query_range[1]), min(extent[2], y + query_range[1] + 1)):
             line = (b * extent[1] + cz) * extent[2] + cy
             at, stop = lines[line], lines[line + 1]
             if stop - at > 8:
-                at += np.searchsorted(column[at:stop], x - reach[2])
-            while at < stop and column[at] <= x + reach[2] and n < len(near):
-                if column[at] >= x - reach[2]:
+                at += np.searchsorted(column[at:stop], x - query_range[2])
+            while at < stop and column[at] <= x + query_range[2] and n < len(near):
+                if column[at] >= x - query_range[2]:
                     row = order[at]
-                    dx = centres[row, 0] - points[i, 0]
-                    dy = centres[row, 1] - points[i, 1]
-                    dz = centres[row, 2] - points[i, 2]
+                    dx = centers[row, 0] - points[i, 0]
+                    dy = centers[row, 1] - points[i, 1]
+                    dz = centers[row, 2] - points[i, 2]
                     if dx * dx + dy * dy + dz * dz <= query.limit:
                         near[n] = row
                         n += 1
@@ -121,8 +123,8 @@ def _search(query, found, first, last):
 
 
 @jit
-def _pool(query, samples, features, slopes, shift, out, first, last):
-    near = np.empty(samples, np.int64)
+def _pool(query, max_samples, features, slopes, shift, out, first, last):
+    near = np.empty(max_samples, np.int64)
     zero = np.float32(0.0)
     for i in range(first, last):
         n = _near(query, i, near)
@@ -131,9 +133,9 @@ def _pool(query, samples, features, slopes, shift, out, first, last):
             best[c] = -np.inf if n > 0 else shift[c]
         for k in range(n):
             row = features[near[k]]
-            dx = query.centres[near[k], 0] - query.points[i, 0]
-            dy = query.centres[near[k], 1] - query.points[i, 1]
-            dz = query.centres[near[k], 2] - query.points[i, 2]
+            dx = query.centers[near[k], 0] - query.points[i, 0]
+            dy = query.centers[near[k], 1] - query.points[i, 1]
+            dz = query.centers[near[k], 2] - query.points[i, 2]
             for c in range(len(shift)):
                 value = row[c] + (dx * slopes[0, c] + dy * slopes[1, c] + dz * slopes[2, c] + shift[c])
                 if not (best[c] >= value or best[c] != best[c]):  # a NaN is kept

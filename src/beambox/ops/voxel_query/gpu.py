@@ -17,24 +17,24 @@ BLOCK = 64
 
 
 def voxel_query(
-    points: Tensor, cells: Tensor, sites: Sites, centres: Tensor, reach: Triple, radius: float, samples: int
+    points: Tensor, cells: Tensor, sites: Sites, centers: Tensor, query_range: Triple, radius: float, max_samples: int
 ) -> Tensor:
     """Find the first active voxels around each point; see :func:`beambox.ops.voxel_query.voxel_query`."""
-    found = torch.full((len(points), samples), -1, dtype=torch.int64, device=points.device)
+    found = torch.full((len(points), max_samples), -1, dtype=torch.int64, device=points.device)
     if len(sites) == 0 or len(points) == 0:
         return found
     limit = constant((radius,), points.device, points.dtype) ** 2  # rounded as the reference rounds
     _search[(triton.cdiv(len(points), BLOCK),)](
-        points.contiguous(), cells.contiguous(), centres.contiguous(), sites.sorted_keys, sites.order, found, limit,
-        len(points), len(sites), len(sites).bit_length(), sites.batch_size, *sites.shape, *reach, samples, BLOCK,
-        enable_fp_fusion=False,
+        points.contiguous(), cells.contiguous(), centers.contiguous(), sites.sorted_keys, sites.order, found, limit,
+        len(points), len(sites), len(sites).bit_length(), sites.batch_size, *sites.shape, *query_range, max_samples,
+        BLOCK, enable_fp_fusion=False,
     )  # fmt: skip
     return found
 
 
 @triton.jit
 def _search(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
-    points, cells, centres, keys, order, found, limit, count, sites, steps, nb, nz, ny, nx, rz, ry, rx, samples,
+    points, cells, centers, keys, order, found, limit, count, sites, steps, nb, nz, ny, nx, rz, ry, rx, max_samples,
     block: tl.constexpr,
 ):  # fmt: skip
     """Write the rows found by one block of points."""
@@ -47,12 +47,12 @@ def _search(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
     has = has & (z - nz < rz) & (y - ny < ry) & (x - nx < rx)
     z, y, x = tl.where(has, z, 0), tl.where(has, y, 0), tl.where(has, x, 0)
     px, py = tl.load(points + at * 3, has, 0.0), tl.load(points + at * 3 + 1, has, 0.0)
-    pz, reach = tl.load(points + at * 3 + 2, has, 0.0), tl.load(limit)
+    pz, query_range = tl.load(points + at * 3 + 2, has, 0.0), tl.load(limit)
     n = tl.zeros((block,), tl.int32)
     first = tl.zeros((block,), tl.int64) - 1
     for line in range((2 * rz + 1) * (2 * ry + 1)):
         cz, cy = z + line // (2 * ry + 1) - rz, y + line % (2 * ry + 1) - ry
-        open_ = has & (n < samples) & (cz >= 0) & (cz < nz) & (cy >= 0) & (cy < ny)
+        open_ = has & (n < max_samples) & (cz >= 0) & (cz < nz) & (cy >= 0) & (cy < ny)
         if tl.max(open_.to(tl.int32), axis=0) > 0:
             start = ((b * nz + cz) * ny + cy) * nx
             wanted = start + tl.maximum(x - rx, 0)  # the line's first cell within reach
@@ -65,15 +65,15 @@ def _search(  # noqa: PLR0913, PLR0917 - kernels take sizes one by one
                 low = tl.where(smaller & (low < high), middle + 1, low)
                 high = tl.where(smaller, high, middle)
             for step in range(2 * rx + 1):  # an active cell of the line a step
-                here = open_ & (low + step < sites) & (n < samples)
+                here = open_ & (low + step < sites) & (n < max_samples)
                 here = here & (tl.load(keys + low + step, here, 0x7FFFFFFFFFFFFFFF) <= last)
                 row = tl.load(order + low + step, here, 0)
-                dx = tl.load(centres + row * 3, here, 0.0) - px
-                dy = tl.load(centres + row * 3 + 1, here, 0.0) - py
-                dz = tl.load(centres + row * 3 + 2, here, 0.0) - pz
-                hit = here & (dx * dx + dy * dy + dz * dz <= reach)
-                tl.store(found + at * samples + n, row, hit)
+                dx = tl.load(centers + row * 3, here, 0.0) - px
+                dy = tl.load(centers + row * 3 + 1, here, 0.0) - py
+                dz = tl.load(centers + row * 3 + 2, here, 0.0) - pz
+                hit = here & (dx * dx + dy * dy + dz * dz <= query_range)
+                tl.store(found + at * max_samples + n, row, hit)
                 first = tl.where(hit & (n == 0), row, first)
                 n += hit.to(tl.int32)
-    for k in range(samples):
-        tl.store(found + at * samples + k, first, has & (k >= n) & (n > 0))
+    for k in range(max_samples):
+        tl.store(found + at * max_samples + k, first, has & (k >= n) & (n > 0))

@@ -1,0 +1,1 @@
+"""beambox.visualize."""
