@@ -389,7 +389,7 @@ def test_the_command_leaves_no_file_where_the_comparison_fails(
 
 
 def test_metadata_are_plain_json(pillars: Exported) -> None:
-    held = {prop.key: prop.value for prop in onnx.load(pillars.path).metadata_props}
-    assert json.loads(held["beambox"])["format"] == "beambox-onnx-1"
-    plain = dict(line.split(" ", 1) for line in held["beambox-plain"].splitlines())
+    values = {prop.key: prop.value for prop in onnx.load(pillars.path).metadata_props}
+    assert json.loads(values["beambox"])["format"] == "beambox-onnx-1"
+    plain = dict(line.split(" ", 1) for line in values["beambox-plain"].splitlines())
     assert plain["class"] == "Car" and plain["cells"] == "64 64 1" and plain["nms_iou"] == "0.01"

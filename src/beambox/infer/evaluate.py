@@ -12,7 +12,8 @@ import torch
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
 from beambox.detectors.contract import AnyModel, module_of
-from beambox.io import check_file_name, write_text
+from beambox.file_names import check_file_name
+from beambox.io import write_text
 from beambox.metrics import once
 from beambox.metrics.box_errors import box_errors
 from beambox.metrics.box_errors_result import BoxErrors

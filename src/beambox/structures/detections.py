@@ -12,9 +12,9 @@ from torch import Tensor
 
 from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean, expect_same_length, expect_shape, printable
+from beambox.file_names import name_to_word
 from beambox.geometry.boxes import corners_3d
 from beambox.geometry.calibration import Calibration
-from beambox.io import name_to_word
 from beambox.structures import conversions, rows
 from beambox.structures.selecting import Index, as_numbers, floats, integers, positions, rows_of, same_fields
 

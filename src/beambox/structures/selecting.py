@@ -57,9 +57,8 @@ def _position(index: object, length: int) -> int:
         position = operator.index(cast("SupportsIndex", index))  # refused below where it is none
     except TypeError:
         raise _no_index(index) from None
-    truth = isinstance(index, bool | np.bool_) or (isinstance(index, Tensor) and index.dtype == torch.bool)
-    if truth:
-        raise _no_index(cast("object", index))
+    if isinstance(index, bool) or getattr(index, "dtype", None) in (torch.bool, np.dtype(bool)):
+        raise _no_index(index)
     if not -length <= position < length:
         raise IndexError(f"position {position} lies outside of {length} entries")
     return position % length
