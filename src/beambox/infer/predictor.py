@@ -211,7 +211,7 @@ class Detector:
         survive_fork()
         lower = self.dtype != torch.float32
         with torch.autocast(self.device.type, dtype=self.dtype if lower else torch.bfloat16, enabled=lower):
-            self.ground.learn(self.model, self.grid)
+            self.ground.learn(module_of(self.model), self.grid)
             return self.model(batch, self.grid)
 
     @torch.inference_mode()
