@@ -22,7 +22,9 @@ from beambox.geometry import VoxelGrid
 from beambox.geometry.axes import Axes
 from beambox.infer.bn_folding import fold_batch_norms
 from beambox.infer.forking import survive_fork
+from beambox.infer.ground import EmptyGround
 from beambox.infer.inputs import Sweep, read_sweep
+from beambox.infer.memory import keep_memory
 from beambox.infer.precision import choose_device, choose_precision
 from beambox.infer.sensor_alignment import SensorAlignment
 from beambox.infer.sensor_profile import SensorProfile
@@ -88,6 +90,9 @@ class Detector:
         survive_fork()
         folded = fold_batch_norms(module_of(model)).to(self.device)
         self.model: AnyModel = model_of(channels_last(folded))
+        self.ground = EmptyGround()
+        if self.device.type == "cpu":
+            keep_memory()
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -206,6 +211,7 @@ class Detector:
         survive_fork()
         lower = self.dtype != torch.float32
         with torch.autocast(self.device.type, dtype=self.dtype if lower else torch.bfloat16, enabled=lower):
+            self.ground.learn(module_of(self.model), self.grid)
             return self.model(batch, self.grid)
 
     @torch.inference_mode()

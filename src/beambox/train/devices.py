@@ -36,7 +36,7 @@ def choose_precision(wanted: str, device: str) -> str:
         raise BeamboxError("precision float16 needs a GPU; on a CPU take auto, bfloat16 or float32")
     if wanted != "auto":
         return wanted
-    return "float32" if bfloat16_reason(torch.device(device)) else "bfloat16"
+    return "float32" if bfloat16_reason(torch.device(device), training=True) else "bfloat16"
 
 
 def make_fabric(precision: str) -> Fabric:

@@ -262,6 +262,10 @@ class Run:
         log.info(f"validation after step {self.step}: {score.text}{'  (best so far)' if better else ''}")
         log.info(f"  took {duration(time.perf_counter() - start)}")
         log.record(self.step, {f"validation/{name}": value for name, value in score.scalars.items()})
+        if log.shows_pictures:
+            log.curves(self.step, score.curves)
+            for name, picture in self.validator.pictures(score):
+                log.picture(self.step, name, picture)
         self.fabric.barrier()
 
     def validation_due(self) -> bool:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_triton, choose
+from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_triton, choose, exporting
 
 __all__ = ["ConvSpec", "KernelMap", "Sites", "Triple"]
 
@@ -202,7 +202,10 @@ class Sites:
     def trusted(cls, indices: Tensor, shape: Triple, batch_size: int) -> Sites:
         """Return sites from int64 indices (b, z, y, x) that are known to lie inside, none twice: nothing is read."""
         sorted_keys, order = torch.sort(linear_keys(indices, shape))
-        return cls(sorted_keys, order, shape, batch_size)
+        sites = cls(sorted_keys, order, shape, batch_size)
+        if exporting():  # runtimes that divide in float32 would get them wrong from keys beyond 2^24
+            sites.__dict__["indices"] = indices  # where cached_property looks
+        return sites
 
     @classmethod
     def from_keys(cls, keys: Tensor, shape: Triple, batch_size: int) -> Sites:

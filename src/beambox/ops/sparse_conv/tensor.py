@@ -73,9 +73,10 @@ class SparseTensor:
     def sorted(self) -> SparseTensor:
         """Return the same tensor with its sites in ascending (b, z, y, x) order, which makes gathering local."""
         sites = self.sites
-        return SparseTensor(
-            self.features[sites.order], Sites.from_keys(sites.sorted_keys, sites.shape, sites.batch_size)
-        )
+        ascending = Sites.from_keys(sites.sorted_keys, sites.shape, sites.batch_size)
+        if exporting():
+            ascending.__dict__["indices"] = sites.indices[sites.order]  # as in Sites.trusted
+        return SparseTensor(self.features[sites.order], ascending)
 
     def to_dense(self) -> Tensor:
         """Return ``(B, C, Z, Y, X)`` with zeros at the sites that are not active."""
