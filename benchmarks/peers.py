@@ -327,7 +327,8 @@ def show(details: dict[str, Any]) -> None:
     print(
         f"{details['processor']}; torch {details['torch']}, {details['threads']} threads, load {details['load_average']:.1f}"
     )
-    print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn; medians over sweeps of each sweep's runs")
+    print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn")
+    print("medians over sweeps of each sweep's runs")
     print(f"{'':44} {'version':>12} {'median':>10} {'shortest':>10} {'differs by':>11}")
     sides = details["sides"]
     for name, row in sides.items():
