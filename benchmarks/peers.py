@@ -324,9 +324,8 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def show(details: dict[str, Any]) -> None:
     """Print the table and the ratios."""
-    print(
-        f"{details['processor']}; torch {details['torch']}, {details['threads']} threads, load {details['load_average']:.1f}"
-    )
+    print(f"{details['processor']}; torch {details['torch']}, {details['threads']} threads")
+    print(f"load {details['load_average']:.1f}")
     print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn")
     print("medians over sweeps of each sweep's runs")
     print(f"{'':44} {'version':>12} {'median':>10} {'shortest':>10} {'differs by':>11}")
