@@ -30,7 +30,7 @@ UNITS = {
     "points": "points of a sweep",
     "range": "metres to each side",
     "batch": "sweeps in a pass",
-    "boxes": "candidates",
+    "boxes": "candidates before suppression",
 }
 
 
@@ -102,6 +102,7 @@ def draw(told: dict[str, list[dict[str, float]]], title: str, path: Path) -> Non
             axis.set_xscale("log")
         axis.set_ylim(bottom=0)
         beside.set_ylim(bottom=0)
+        beside.set_visible(what != "boxes")
     axes[0].legend(handles=[time, memory], loc="upper left", fontsize=8)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=110, metadata={"Software": None})
@@ -120,7 +121,7 @@ def main() -> None:
         be(arguments.model, arguments.side[0], float(arguments.side[1]), arguments.threads)
         return
     told: dict[str, Any] = measure(arguments)
-    draw(told, f"{arguments.model}, {arguments.threads} threads, float32", arguments.out)
+    draw(told, f"{arguments.model}, threads: {arguments.threads}, float32", arguments.out)
     if arguments.json:
         arguments.json.write_text(json.dumps(told, indent=1))
 
