@@ -2,8 +2,8 @@
 
     python benchmarks/same_detections.py [KITTI] [--models pointpillars-kitti ...] [--every 1]
 
-Every sweep passes through two detectors of the same weights, float32; one computes all cells by PyTorch's convolutions of
-maps. Prints the largest differences of boxes (metres, radians) and scores, and each sweep beyond 1e-3 or 1e-4.
+Every sweep passes through two detectors of the same weights, float32; one computes all cells by PyTorch's convolutions
+of maps. Prints the largest differences of boxes (metres, radians) and scores, and each sweep beyond 1e-3 or 1e-4.
 """
 
 from __future__ import annotations
