@@ -336,7 +336,7 @@ class DensityBranch(nn.Module):
             raise BeamboxError(f"`max_count` must be at least 1 (a voxel counts itself), or none; got {max_count}")
         self.radii = tuple(radii)
         self.count_set = chosen("count_set", count_set, CountSet)
-        self.normalization = chosen("normalisation", normalization, Normalization)
+        self.normalization = chosen("normalization", normalization, Normalization)
         self.max_count = max_count
         self.own_points = own_points
         self.depth = depth

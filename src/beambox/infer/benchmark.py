@@ -20,6 +20,7 @@ from torch import nn
 from beambox import __version__
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.detectors.catalog import build
+from beambox.detectors.contract import module_of
 from beambox.infer.peaks import machine_peaks
 from beambox.infer.predictor import Detector
 from beambox.io import read_yaml
@@ -204,7 +205,7 @@ def one_pass(detector: Detector, paths: Sequence[Path]) -> tuple[dict[str, float
     prepared = Batch.of([detector.prepare(frame) for frame in frames]).to(detector.device)
     start = clock.now()
     first_layer: list[float] = []
-    with calling(detector.model, lambda: first_layer.append(clock.now()) if not first_layer else None):
+    with calling(module_of(detector.model), lambda: first_layer.append(clock.now()) if not first_layer else None):
         predictions = detector.predict(prepared)
     done = clock.now()
     detector.finish(predictions, frames)

@@ -15,7 +15,7 @@ from beambox.layers.anchors import AnchorGrid
 from beambox.layers.assigners import assign
 from beambox.layers.coders import decode_boxes, direction_bin, encode_boxes, resolve_heading
 from beambox.layers.losses import sigmoid_focal, sine_difference, smooth_l1
-from beambox.ops.dispatch import waiting_is_dear
+from beambox.ops.dispatch import exporting, waiting_is_dear
 from beambox.ops.map_conv import GroundedConv, MapKernel
 from beambox.ops.nms import nms, nms_of_samples
 
@@ -256,6 +256,9 @@ def best_of_samples(score: Tensor, threshold: float, limit: int) -> tuple[Tensor
         The P best scores ``(B, P)`` and their rows ``(B, P)`` int64, and how many of them count ``(B,)`` int64.
     """
     known = torch.where(score >= threshold, score, -torch.inf)
+    if exporting():  # the operator of ONNX; which of equals comes first is its own affair
+        known, rows = known.topk(min(limit, known.shape[1]), dim=1)
+        return known, rows, (known > -torch.inf).sum(dim=1)
     known, rows = known.sort(dim=1, descending=True, stable=True)
     known, rows = known[:, :limit], rows[:, :limit]
     return known, rows, (known > -torch.inf).sum(dim=1)

@@ -16,8 +16,29 @@ from typing import Any
 
 import numba
 import torch
+from numba.core import event
+
+from beambox.progress import CompileNotice
 
 __all__ = ["jit", "jit_fastmath", "parallel_for"]
+
+
+class _Compiled(event.Listener):
+    """Hears of each kernel of ours that numba compiles; those that it finds on disk are no such event."""
+
+    notice = CompileNotice()
+
+    def on_start(self, event: event.Event) -> None:
+        """Say so, where somebody is waiting at a terminal."""
+        function = getattr((event.data or {}).get("dispatcher"), "py_func", None)
+        if getattr(function, "__module__", "").startswith("beambox."):
+            self.notice()
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing: the result says that it is done."""
+
+
+event.register("numba:compile", _Compiled())
 
 
 def jit(function: Callable[..., Any]) -> Callable[..., Any]:
