@@ -30,7 +30,7 @@ UNITS = {
     "points": "points of a sweep",
     "range": "metres to each side",
     "batch": "sweeps in a pass",
-    "boxes": "candidates",
+    "boxes": "candidates before suppression",
 }
 
 
@@ -102,6 +102,7 @@ def draw(details: dict[str, list[dict[str, float]]], title: str, path: Path) -> 
             axis.set_xscale("log")
         axis.set_ylim(bottom=0)
         beside.set_ylim(bottom=0)
+        beside.set_visible(what != "boxes")
     axes[0].legend(handles=[time, memory], loc="upper left", fontsize=8)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=110, metadata={"Software": None})
@@ -120,7 +121,7 @@ def main() -> None:
         be(arguments.model, arguments.side[0], float(arguments.side[1]), arguments.threads)
         return
     details: dict[str, Any] = measure(arguments)
-    draw(details, f"{arguments.model}, {arguments.threads} threads, float32", arguments.out)
+    draw(details, f"{arguments.model}, threads: {arguments.threads}, float32", arguments.out)
     if arguments.json:
         arguments.json.write_text(json.dumps(details, indent=1))
 

@@ -13,7 +13,8 @@ All run the same network with the same random weights, whose outputs are checked
 * torch-pointcloud: its own PointPillars, the network alone, from voxels in memory.
 
 And the sparse backbone of SECOND here and in spconv (which runs on one thread: on more it is wrong in a share of runs).
-Each side is a process of its own, with as many threads; sides alternate on every sweep.
+Each side is a process of its own, with as many threads; sides alternate on every sweep. On a busy machine trust the CPU
+time with --threads 1: threads that wait for each other wait for other programs, too.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ SIDES = {  # name -> package that it needs, whether it computes PointPillars' bo
     "spconv, sparse backbone, 1 thread": ("spconv", False),
 }
 OURS = "beambox, points to boxes"
+KINDS = ("median_ms", "median_of_shortest_ms", "median_of_least_cpu_ms")
 Runs = tuple[Callable[[int], object], Callable[[int], Any] | None]
 """What computes scan number k, and what returns its boxes and scores."""
 
@@ -293,10 +295,13 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     sides = {name: Side(name, [__file__, *common, "--side", name], arguments.threads, packages) for name in wanted}
     count = int(next(iter(sides.values())).details)
     times: dict[str, list[list[float]]] = {name: [[] for _ in range(count)] for name in sides}
+    busy: dict[str, list[list[float]]] = {name: [[] for _ in range(count)] for name in sides}
     for _ in range(arguments.rounds):
         for k in range(count):
             for name, side in sides.items():
-                times[name][k].append(float(side.ask(f"run {k}").split()[0]) * 1e3)
+                wall, cpu = (float(seconds) * 1e3 for seconds in side.ask(f"run {k}").split())
+                times[name][k].append(wall)
+                busy[name][k].append(cpu)
     differ = agreement(sides, folder)
     medians = {
         name: statistics.median(statistics.median(of_scan) for of_scan in scans) for name, scans in times.items()
@@ -324,23 +329,23 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def show(details: dict[str, Any]) -> None:
     """Print the table and the ratios."""
-    print(f"{details['processor']}; torch {details['torch']}, {details['threads']} threads")
-    print(f"load {details['load_average']:.1f}")
-    print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn")
-    print("medians over sweeps of each sweep's runs")
-    print(f"{'':44} {'version':>12} {'median':>10} {'shortest':>10} {'differs by':>11}")
+    print(
+        f"{details['processor']}; torch {details['torch']}, {details['threads']} threads, load {details['load_average']:.1f}"
+    )
+    print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn; medians over sweeps of each sweep's runs")
+    print(f"{'':44} {'version':>12} {'median':>10} {'shortest':>10} {'CPU time':>10} {'differs by':>11}")
     sides = details["sides"]
     for name, row in sides.items():
         differs = "" if row["differs"] is None else f"{row['differs']:.1e}"
         print(
             f"{name:44} {row['version'] or '':>12} {row['median_ms']:7.1f} ms {row['median_of_shortest_ms']:7.1f} ms "
-            f"{differs:>11}"
+            f"{row['median_of_least_cpu_ms']:7.1f} ms {differs:>11}"
         )
     for name, row in sides.items():
         if OURS in sides and name != OURS and "sparse" not in name:
             first = sides[OURS]
-            ratios = [first[key] / row[key] for key in ("median_ms", "median_of_shortest_ms")]
-            print(f"{OURS} takes {ratios[0]:.2f} of the time of {name} (medians), {ratios[1]:.2f} (shortest)")
+            ratios = " / ".join(f"{first[key] / row[key]:.2f}" for key in KINDS)
+            print(f"{OURS} takes {ratios} of the time of {name} (medians / shortest / CPU time)")
     sparse = [row for name, row in sides.items() if "sparse" in name]
     if len(sparse) == 2:
         ratios = [sparse[1][key] / sparse[0][key] for key in ("median_ms", "median_of_shortest_ms")]

@@ -51,6 +51,10 @@ def detector(name: str, seed: int = 0) -> Detector:
     return Detector(model, precision="float32", device="cpu")
 
 
+def network(found: Detector) -> Any:
+    return found.model
+
+
 class NeverLearns(EmptyGround):
     def learn(self, model: torch.nn.Module, grid: VoxelGrid) -> None:
         """Do nothing."""
@@ -72,7 +76,7 @@ def test_the_same_bits_as_when_all_cells_are_computed(name: str, frames: list[Fr
     for _ in range(2):
         learned.predict(Batch.of(frames[:1]))
     memories = [
-        part.folded for part in learned.model.modules() if isinstance(getattr(part, "folded", None), GroundedConv)
+        part.folded for part in network(learned).modules() if isinstance(getattr(part, "folded", None), GroundedConv)
     ]
     assert memories and all(memory._grounds for memory in memories), "else nothing is left out"
     fresh.ground = NeverLearns()
@@ -96,7 +100,7 @@ def test_changed_weights_are_noticed_and_learnt_again(frames: list[Frame]) -> No
     for _ in range(3):
         found.predict(Batch.of(frames[:1]))
     other = detector("pointpillars", seed=5)
-    found.model.load_state_dict(other.model.state_dict())
+    network(found).load_state_dict(network(other).state_dict())
     for _ in range(3):
         assert all(map(torch.equal, answers(found, frames[0]), answers(detector("pointpillars", seed=5), frames[0])))
     assert found.ground.learnt()
@@ -106,11 +110,11 @@ def test_parameters_put_in_place_of_others_are_used(frames: list[Frame]) -> None
     found = detector("pointpillars")
     for _ in range(3):
         found.predict(Batch.of(frames[:1]))
-    conv = found.model.backbone.stages[0][1][0]
+    conv = network(found).backbone.stages[0][1][0]
     conv.weight = torch.nn.Parameter(-2 * conv.weight.detach())
     fresh = detector("pointpillars")
     with torch.no_grad():
-        fresh.model.backbone.stages[0][1][0].weight.mul_(-2)
+        network(fresh).backbone.stages[0][1][0].weight.mul_(-2)
     assert all(map(torch.equal, answers(found, frames[0]), answers(fresh, frames[0])))
 
 

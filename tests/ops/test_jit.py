@@ -1,6 +1,7 @@
 """Compiling kernels, with and without a folder for the cache, and running them in blocks."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import beambox.ops.jit as jit_module
 from beambox.ops.jit import jit, parallel_for
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -74,3 +76,38 @@ def test_jit_works_where_no_cache_folder_can_be_written(tmp_path):
 
 def test_jit_compiles(tmp_path):
     assert jit(lambda x: x + 1)(np.float32(1)) == 2
+
+
+def test_helpers_that_are_busy_elsewhere_are_not_waited_for(threads):
+    threads(2)
+    parallel_for(lambda start, stop: None, 10)  # so that there are helpers
+    release, seen = threading.Event(), np.zeros(10, int)
+    pool = jit_module._pool()
+    for _ in range(pool._max_workers):
+        pool.submit(release.wait)
+
+    def kernel(start, stop):
+        seen[start:stop] += 1
+
+    try:
+        parallel_for(kernel, 10)
+        assert (seen == 1).all()
+    finally:
+        release.set()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_forked_process_has_helpers_of_its_own(threads):
+    threads(2)
+    parallel_for(lambda start, stop: None, 10)
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        signal.alarm(20)  # a helper that does not exist would be waited for
+        seen = np.zeros(10, int)
+
+        def kernel(start, stop):
+            seen[start:stop] += 1
+
+        parallel_for(kernel, 10)
+        os._exit(0 if (seen == 1).all() else 1)
+    assert os.waitpid(child, 0)[1] == 0

@@ -7,10 +7,11 @@ used before a fork, and data loaders do both.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from threading import Lock
+from threading import Event, Lock
 from typing import Any
 
 import numba
@@ -66,36 +67,73 @@ def _compile(function: Callable[..., Any], fastmath: bool | set[str]) -> Callabl
 PIECES = 4
 """Blocks a thread: one that another program holds up then leaves its share to the others."""
 
+_helpers: list[ThreadPoolExecutor] = []
+"""At most one pool, whose threads wait for work without using a core."""
+
+
+def _pool() -> ThreadPoolExecutor:
+    if not _helpers:
+        _helpers.append(ThreadPoolExecutor(max(1, (os.cpu_count() or 1) - 1), "beambox"))
+    return _helpers[0]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_helpers.clear)  # its threads do not exist there
+
 
 def parallel_for(kernel: Callable[[int, int], None], length: int, smallest: int = 1) -> None:
     """Run ``kernel(start, stop)`` over ``0 .. length`` in blocks, each taken by the next free thread.
 
-    Blocks must be independent, so that the result does not depend on their number or order.
+    Blocks must be independent, so that the result does not depend on their number or order. The caller works too, and
+    waits for blocks that others have begun, not for threads that have not come to any.
 
     Args:
-        kernel: releases the interpreter's lock, or nothing is won.
+        kernel: releases the interpreter's lock, or nothing is won; must not call this function.
         length: number of items.
-        smallest: no block is shorter, as starting a thread takes about 0.1 ms.
+        smallest: no block is shorter, as handing one over takes about 0.1 ms.
     """
     most = max(1, length // max(1, smallest))
     threads = min(torch.get_num_threads(), most)
     if threads <= 1:
         kernel(0, length)
         return
-    blocks = min(PIECES * threads, most)
-    edges = [length * i // blocks for i in range(blocks + 1)]
-    left, lock = iter(pairwise(edges)), Lock()
+    count = min(PIECES * threads, most)
+    shared = _Blocks(kernel, [length * i // count for i in range(count + 1)])
+    helpers = [_pool().submit(shared.work) for _ in range(threads - 1)]
+    shared.work()
+    shared.finished.wait()
+    for helper in helpers:
+        helper.cancel()
+    if shared.error is not None:
+        raise shared.error
 
-    def work() -> None:
+
+class _Blocks:
+    """Blocks that are still to be done, for several threads."""
+
+    def __init__(self, kernel: Callable[[int, int], None], edges: list[int]) -> None:
+        self.kernel = kernel
+        self.finished = Event()
+        self.error: BaseException | None = None
+        self._left = list(pairwise(edges))[::-1]
+        self._undone = len(self._left)
+        self._lock = Lock()
+
+    def work(self) -> None:
+        """Do blocks until none is left; after an error no further one is begun."""
         while True:
-            with lock:
-                block = next(left, None)
-            if block is None:
-                return
-            kernel(*block)
-
-    with ThreadPoolExecutor(threads - 1) as pool:
-        waiting = [pool.submit(work) for _ in range(threads - 1)]
-        work()
-        for helper in waiting:
-            helper.result()
+            with self._lock:
+                if not self._left:
+                    return
+                block = self._left.pop()
+            try:
+                self.kernel(*block)
+            except BaseException as error:
+                with self._lock:
+                    self.error = self.error or error
+                    self._undone -= len(self._left)
+                    self._left.clear()
+            with self._lock:
+                self._undone -= 1
+                if self._undone == 0:
+                    self.finished.set()

@@ -23,6 +23,8 @@ from beambox.ops.map_conv.tiles import LANES, ROWS, WIDE, products, transform_in
 
 __all__ = ["map_conv"]
 
+WORTH = 4 << 20
+"""Bytes of a map that one thread compares or copies before another is asked: about a third of a millisecond."""
 CHUNK = 48
 """Base cells worked on together: their transformed rows should stay in a core's own cache."""
 
@@ -67,7 +69,11 @@ def active_cells(x: Tensor, packed: Packed, base: tuple[int, ...], ground: Groun
     table, row, column = arrays(ground.given)
     bits = x.numpy().view(np.int32)
     lines = len(x) * x.shape[1]
-    parallel_for(lambda a, b: _differs(bits, table.view(np.int32), row, column, differs, a, b), lines, 16)
+    parallel_for(
+        lambda a, b: _differs(bits, table.view(np.int32), row, column, differs, a, b),
+        lines,
+        1 + WORTH // bits[0, 0].nbytes,
+    )
     active = np.empty((len(x), *base), np.bool_)
     table, row, column = arrays(ground.answer)
     result = y.numpy()
@@ -76,7 +82,7 @@ def active_cells(x: Tensor, packed: Packed, base: tuple[int, ...], ground: Groun
             differs, packed.in_step, packed.low, packed.high, active, packed.out_step, table, row, column, result, a, b
         ),
         len(x) * base[0],
-        8,
+        1 + WORTH // max(1, 4 * packed.out_step * y.shape[2] * y.shape[3]),
     )
     return np.flatnonzero(active)
 
