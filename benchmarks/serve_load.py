@@ -1,4 +1,4 @@
-"""How many sweeps a second `beambox serve` answers, and how long each takes: clients on this machine, so many requests.
+"""How many sweeps per second `beambox serve` answers, and how long each takes: clients on this machine.
 
 python benchmarks/serve_load.py --model pointpillars-kitti --clients 4 --requests 100
 """
@@ -40,10 +40,10 @@ def main() -> None:
         service.wait(30)
     taken.sort()
     print(
-        f"{options.model}, {len(body) / 1e6:.1f} MB a sweep, {options.clients} clients, {options.requests} requests: "
+        f"{options.model}, {len(body) / 1e6:.1f} MB per sweep, {options.clients} clients, {options.requests} requests: "
         f"{len(taken) / seconds:.2f} answers/s, median {taken[len(taken) // 2] * 1e3:.0f} ms, "
         f"p95 {taken[int(len(taken) * 0.95)] * 1e3:.0f} ms, statuses {dict(statuses)}, "
-        f"{health['sweeps'] / health['batches']:.1f} sweeps a batch"
+        f"{health['sweeps'] / health['batches']:.1f} sweeps per batch"
     )
 
 

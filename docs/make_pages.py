@@ -6,7 +6,6 @@ cards of the shipped weights, recipes.md from the shipped recipes. A test holds 
 
 from __future__ import annotations
 
-import re
 import runpy
 from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint
@@ -22,6 +21,8 @@ from beambox.train.recipes import AUDIENCES, list_recipes
 from beambox.zoo import shipped
 
 DOCS = Path(__file__).resolve().parent
+REFERENCE = runpy.run_path(str(DOCS / "make_reference.py"))
+plain: Callable[[str], str] = REFERENCE["plain"]
 NOT_RUN = "<!-- not run: help texts; each option is checked to exist, and what pages tell to do runs there -->"
 
 
@@ -195,14 +196,8 @@ def cell(text: str) -> str:
     return plain(" ".join(text.split())).replace("|", "\\|")
 
 
-def plain(text: str) -> str:
-    """Return text in which Markdown finds nothing to mark: no tags, no emphasis; what stands as code stays."""
-    parts = re.split(r"(`[^`]*`)", text)
-    return "".join(part if part.startswith("`") else re.sub(r"([<>*_\[\]])", r"\\\1", part) for part in parts)
-
-
 PAGES: dict[str, Callable[[], str]] = {
-    "reference.md": runpy.run_path(str(DOCS / "make_reference.py"))["page"],
+    "reference.md": REFERENCE["page"],
     "command_line.md": command_line,
     "models.md": models,
     "recipes.md": recipes,

@@ -17,6 +17,8 @@ The public API, made from its docstrings by `python docs/make_reference.py`; a t
 is an attribute of `beambox` and loaded on first use. Boxes are x y z l w h yaw in the LiDAR frame, metres and radians
 ([conventions.md](conventions.md)).
 """
+WIDTH = 100
+"""Columns beyond which a signature is spread over lines."""
 GROUPS = {
     "Functions": inspect.isfunction,
     "Classes": inspect.isclass,
@@ -46,10 +48,53 @@ def page() -> str:
 
 def entry(name: str, thing: object, level: str) -> str:
     """Return the section of one name: how it is called, its docstring, and what a class holds."""
-    lines = [f"{level} {name}\n", "```text", f"{name}{signature(thing)}", "```\n", "```text", text(thing), "```\n"]
+    lines = [f"{level} {name}\n", "```text", f"{name}{spread(signature(thing))}", "```\n", *described(text(thing))]
     if inspect.isclass(thing):
         lines += [row for member in members(thing) for row in member]
     return "\n".join(lines)
+
+
+def spread(shown: str) -> str:
+    """Put the parameters of a long signature on lines of their own."""
+    if len(shown) < WIDTH:
+        return shown
+    inside, _, after = shown[1:].rpartition(")")
+    depth, parts = 0, [""]
+    for letter in inside:
+        depth += (letter in "([{") - (letter in ")]}")
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return "(\n" + "".join(f"    {part.strip()},\n" for part in parts) + ")" + after
+
+
+def described(docstring: str) -> list[str]:
+    """Return a docstring as Markdown: its sections (Args, Returns, Raises, ...) as lists, code as it stands."""
+    lines: list[str] = []
+    section = ""
+    for line in docstring.splitlines():
+        head = re.fullmatch(r"(Args|Returns|Yields|Raises|Attributes):", line)
+        if head:
+            section = head[1]
+            lines += [f"**{section}**\n"]
+        elif not section:
+            lines.append(plain(line))
+        elif not line.strip():
+            lines.append("")
+            section = section if section in ("Args", "Raises") else ""
+        elif re.match(r" {4}\S", line) and section in ("Args", "Raises", "Attributes"):
+            word, colon, rest = line.strip().partition(": ")
+            lines.append(f"* `{word}`: {plain(rest)}" if colon else f"* {plain(word)}")
+        else:
+            lines.append(("  " if section in ("Args", "Raises", "Attributes") else "") + plain(line.strip()))
+    return [*lines, ""]
+
+
+def plain(line: str) -> str:
+    """Return a line in which Markdown finds nothing to mark outside of code."""
+    parts = re.split(r"(`[^`]*`)", line)
+    return "".join(part if part.startswith("`") else re.sub(r"([<>*_\[\]])", r"\\\1", part) for part in parts)
 
 
 def members(kind: type) -> Iterator[list[str]]:

@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 CONFIG = "zensical.toml"
-LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
+LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)|(!\[[^\]]*\]\()([^)\s]+)\)")
 LISTED = {".py": "python", ".yaml": "yaml", ".toml": "toml", ".ipynb": "json", ".sbatch": "bash", "": "text"}
 """Endings of the files outside ``docs/`` that may be linked to -> language of their listing."""
 
@@ -43,6 +43,11 @@ def place_of(file: Path) -> PurePosixPath:
         return PurePosixPath(file.relative_to(DOCS).as_posix())
     inside = PurePosixPath(file.relative_to(ROOT).as_posix())
     return "files" / (inside if inside.suffix == ".md" else inside.with_name(inside.name + ".md"))
+
+
+def title_of(page: Path) -> str:
+    """Return the first heading of a page."""
+    return re.findall(r"(?m)^# (.+)$", page.read_text(encoding="utf-8"))[0]
 
 
 def listing(file: Path) -> str:
@@ -87,7 +92,8 @@ def with_links(file: Path) -> tuple[str, list[Path], list[str]]:
     broken: list[str] = []
 
     def moved(match: re.Match[str]) -> str:
-        before, path, anchor, after = match.groups()
+        text, path, anchor, picture, source = match.groups()
+        path = path or source
         if "://" in path or path.startswith("mailto:"):
             return match[0]
         to = Path(os.path.normpath(file.parent / path))
@@ -97,7 +103,12 @@ def with_links(file: Path) -> tuple[str, list[Path], list[str]]:
         if not to.is_relative_to(DOCS):
             linked.append(to)
         start = str(place_of(file).parent)
-        return f"{before}{PurePosixPath(os.path.relpath(place_of(to), start)).as_posix()}{anchor or ''}{after}"
+        where = Path(os.path.relpath(place_of(to), start)).as_posix()
+        if picture:
+            return f"{picture}{where})"
+        if text == path and to.suffix == ".md":  # in a checkout the file's name helps, here its title
+            text = title_of(to)
+        return f"[{text}]({where}{anchor or ''})"
 
     parts = split_code(file.read_text(encoding="utf-8"))
     return "".join(part if code else LINK.sub(moved, part) for code, part in parts), linked, broken

@@ -30,7 +30,7 @@ def test_no_hint_names_a_package_that_no_index_holds(room: str) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ("report", "pointpillars-sim", "--data", "nowhere"),
+        ("report", "pointpillars-sim", "--data", "."),
         ("explain", "hcnet-kitti", "nowhere.bin"),
     ],
     ids=lambda words: words[0],

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-__all__ = ["progress_bar", "track"]
+__all__ = ["CompileNotice", "progress_bar", "track"]
 
 T = TypeVar("T")
 
@@ -43,3 +45,35 @@ def progress_bar(what: str, show: bool = True) -> Iterator[Callable[[int, int], 
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+class CompileNotice:
+    """Says on a terminal that kernels are being compiled, at the first one and every few seconds after it.
+
+    What would otherwise be silence: a first detection compiles about ten kernels, which takes seconds each on a slow
+    machine. Processes that were started to help stay silent, and so does everything where stderr is no terminal.
+    """
+
+    every = 3.0
+    """Seconds between two lines."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._began = self._last = 0.0
+
+    def __call__(self) -> None:
+        """Take note that one more kernel is about to be compiled."""
+        self.count += 1
+        now = time.monotonic()
+        if not self._began:
+            self._began = now
+            self._write("beambox: compiling kernels for this machine; they are kept, so this happens once ...")
+        elif now - self._last >= self.every:
+            self._write(f"beambox: compiling kernels, {self.count} so far, {now - self._began:.0f} s ...")
+        else:
+            return
+        self._last = now
+
+    def _write(self, line: str) -> None:
+        if sys.stderr is not None and sys.stderr.isatty() and multiprocessing.parent_process() is None:
+            print(line, file=sys.stderr, flush=True)

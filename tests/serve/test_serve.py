@@ -100,7 +100,8 @@ def test_options_of_the_query(detector: Detector) -> None:
         for query, words in {
             "score_threshold=nan": "from 0 to 1", "score_threshold=2": "from 0 to 1", "score_threshold=": "from 0 to 1",
             "score_treshold=1": "did you mean", "format=exe": "must be one of bin, npy",
-            "frame=../a": "separator of folders", "fields=a,b": "must name x, y and z", "frame=" + "a" * 401: "401 characters",
+            "frame=../a": "separator of folders", "fields=a,b": "must name x, y and z",
+            "frame=" + "a" * 401: "401 characters",
         }.items():  # fmt: skip
             answer = await client.post(f"/detect?{query}", content=SWEEP.tobytes())
             assert 400 <= answer.status_code < 500 and words in answer.json()["error"], answer.text

@@ -10,6 +10,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "beambox.cli.demo:command",
         "simulate a few sweeps, detect, score, draw: under a minute, nothing else needed",
     ),
+    "setup": ("beambox.cli.setup:command", "compile kernels for this machine, so that the first detection is fast"),
     "detect": ("beambox.cli.detect:command", "find objects in sweeps: files, folders, patterns, recordings"),
     "show": ("beambox.cli.show:command", "draw sweeps in BEV, with boxes, and the boxes into the camera image"),
     "stream": ("beambox.cli.stream:command", "detect and track through a recording; boxes as a recording"),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
 from beambox.cli.console import announce, log, progress, show_log
+from beambox.cli.detector_options import DetectorOptions, takes_detector_options
 
 if TYPE_CHECKING:
     from beambox.infer.inputs import Sweep
@@ -27,7 +28,8 @@ REACH = 75.0
 """Points farther than this to a side are no loss, metres."""
 
 
-def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+@takes_detector_options
+def command(  # each is an option of the command line
     inputs: options.InputsArgument,
     model: options.DefaultModelOption = "",
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
@@ -37,21 +39,14 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         str, typer.Option("--format", "-f", metavar="F", help="json, csv, kitti, jsonl, parquet.")
     ] = "json",
     score_threshold: options.ScoreThresholdOption = 0.0,
-    range_: options.RangeOption = "",
-    view: options.ViewOption = "auto",
-    sensor_height: options.HeightOption = None,
-    axes: options.AxesOption = "",
-    ground_slope: options.SlopeOption = "",
-    intensity_scale: options.IntensityOption = None,
-    fields: options.FieldsOption = "",
-    device: options.DeviceOption = "auto",
-    precision: options.PrecisionOption = "auto",
     skip_existing: Annotated[bool, typer.Option("--skip-existing", help="Leave out sweeps that are done.")] = False,
     shard: Annotated[str, typer.Option(metavar="I/N", help="Do the I-th of N parts, as on machine I of N.")] = "1/1",
     workers: Annotated[int, typer.Option(min=1, max=1024, metavar="W", help="Processes, of one thread each.")] = 1,
     ray: Annotated[
         int, typer.Option(min=0, max=100_000, metavar="N", help="Do N parts as tasks of a Ray cluster.")
     ] = 0,
+    *,
+    how: DetectorOptions,
 ) -> None:
     """Find objects in sweeps; writes one result file per sweep.
 
@@ -68,7 +63,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     from beambox.zoo import DEFAULT
 
     options.expect_there(inputs, model)
-    parsed_range, slope = options.parse_range(range_), options.parse_slope(ground_slope)
+    chosen = how.for_load()
     if not model:
         model = DEFAULT
         log(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
@@ -82,17 +77,6 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     sweeps = find_sweeps(inputs)
     if "kitti" in kinds:
         need_calibration(sweeps)
-    chosen: dict[str, Any] = {
-        "device": device,
-        "precision": precision,
-        "range": parsed_range,
-        "view": view,
-        "sensor_height": sensor_height,
-        "axes": axes or None,
-        "ground_slope": slope,
-        "intensity_scale": intensity_scale,
-        "fields": fields or None,
-    }
     if ray:
         detect_on_ray(sweeps, Job(model, chosen, out, kinds, score_threshold, part), ray, skip_existing, workers)
         return

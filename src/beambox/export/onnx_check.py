@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from beambox.checks import BeamboxError, MissingFileError, how_to_install
+from beambox.checks import BeamboxError, MissingFileError, import_library
 from beambox.detectors.kassd import KamScore, KASSDPredictions
 from beambox.geometry.boxes import wrap_angle
 from beambox.geometry.grid import VoxelGrid
@@ -213,9 +213,7 @@ def box_differences(boxes: Tensor, wanted: Tensor, direction: Tensor) -> tuple[T
 
 def opened(content: bytes) -> Any:
     """Open a file's content in onnxruntime, on the CPU."""
-    if not runtime_is_there():
-        raise BeamboxError(f"comparing needs onnxruntime: {how_to_install('export')}")
-    import onnxruntime
+    onnxruntime = import_library("onnxruntime", "export", "comparing")
     from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidGraph, InvalidProtobuf, NotImplemented
 
     options = onnxruntime.SessionOptions()

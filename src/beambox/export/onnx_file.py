@@ -22,8 +22,9 @@ import torch
 from torch import Tensor, nn
 
 from beambox import __version__
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, lacking
 from beambox.detectors.catalog import config_to_dict, name_of
+from beambox.detectors.contract import AnyModel
 from beambox.detectors.hcnet import HCNet
 from beambox.detectors.kassd import KASSD
 from beambox.detectors.pointpillars import PointPillars
@@ -42,7 +43,6 @@ Exportable = PointPillars | HCNet | SECOND | KASSD
 OPSETS = range(18, 24)
 """Versions of ONNX's operators that can be asked for; before 18 there is no maximum over groups."""
 FORMAT = "beambox-onnx-1"
-INSTALL = how_to_install("export")
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class ExportedGraph(nn.Module):
 
 
 def export_onnx(
-    model: nn.Module,
+    model: AnyModel,
     path: str | Path,
     *,
     grid: VoxelGrid | None = None,
@@ -134,11 +134,11 @@ def export_onnx(
         raise BeamboxError(f"the file to write must end in .onnx, got {path}")
     if opset not in OPSETS:
         raise BeamboxError(f"`opset` must lie in {OPSETS[0]} .. {OPSETS[-1]}, got {opset}")
-    missing = [name for name in ("onnx", "onnxscript") if find_spec(name) is None]
-    if missing:
-        raise BeamboxError(f"exporting needs {' and '.join(missing)}: {INSTALL}")
+    for name in ("onnx", "onnxscript"):
+        if find_spec(name) is None:
+            raise lacking(name, "export", "exporting")
     if sweeps and not runtime_is_there():
-        raise BeamboxError(f"comparing needs onnxruntime: {INSTALL}")
+        raise lacking("onnxruntime", "export", "comparing")
     proto = traced(ExportedGraph(detector, grid or detector.config.grid).eval(), opset)
     about = described(detector, grid or detector.config.grid, card or {})
     proto.metadata_props.add(key="beambox", value=json.dumps(about, sort_keys=True))
@@ -156,7 +156,7 @@ def export_onnx(
     return Written(path, len(content), shapes(proto.graph.input), shapes(proto.graph.output), tuple(checks))
 
 
-def exportable(model: nn.Module) -> Exportable:
+def exportable(model: AnyModel) -> Exportable:
     """Return a float32 copy on the CPU, in evaluation mode; refuse detectors with two stages."""
     if not isinstance(model, Exportable):
         raise BeamboxError(

@@ -64,8 +64,8 @@ def run_on_ray(sweeps: Sequence[Sweep], job: Job, parts: int, *, skip_existing: 
         part = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=TRIES)(_part)
         tallies = ray.get([part.remote(listed, shard) for shard in shards])
     except ray.exceptions.RayError as error:
-        told = " ".join(str(getattr(error, "cause", None) or error).split())[:300]
-        raise BeamboxError(f"a part failed ({told}); go on with the same command and --skip-existing") from None
+        details = " ".join(str(getattr(error, "cause", None) or error).split())[:300]
+        raise BeamboxError(f"a part failed ({details}); go on with the same command and --skip-existing") from None
     finally:
         if started:
             ray.shutdown()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean, how_to_install, printable
-from beambox.io import check_file_name
+from beambox.file_names import check_file_name
 from beambox.serve.batching import Batcher
 from beambox.serve.bodies import FORMATS, choose_format, read_body
 from beambox.serve.limits import RequestError, ServeLimits
@@ -220,8 +220,8 @@ def create_app(
         return Response(await service(request).detect(request), media_type="application/json")
 
     async def health(request: Request) -> Response:
-        told = service(request).health()
-        return JSONResponse(told, 200 if told["status"] == "ok" else 503)
+        details = service(request).health()
+        return JSONResponse(details, 200 if details["status"] == "ok" else 503)
 
     async def about(request: Request) -> Response:
         return JSONResponse(service(request).about())

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from beambox.checks import BeamboxError
 from beambox.data.read_points import SUFFIXES, read_frame
+from beambox.io import write_bytes
 from beambox.serve.limits import RequestError, ServeLimits
 from beambox.structures import Frame
 
@@ -95,7 +96,7 @@ def read_body(
         )
     path = folder / f"body-{next(_numbers)}.{kind}"
     try:
-        path.write_bytes(content)
+        write_bytes(path, content)
         frame = read_frame(path, fields=fields, intensity_scale=intensity_scale)
     except BeamboxError as error:
         message = str(error).replace(str(path), "the body").replace(path.name, "the body")

@@ -1,15 +1,16 @@
-"""What a training run tells: lines on the console, a JSON-lines file, TensorBoard scalars, and where the time went."""
+"""What a training run tells: lines on the console, a JSON-lines file, TensorBoard, and where the time went."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -88,6 +89,41 @@ class RunLog:
             return None
         return SummaryWriter(str(folder), purge_step=first)
 
+    @property
+    def shows_pictures(self) -> bool:
+        """Whether pictures and curves go anywhere."""
+        return self._board is not None
+
+    def curves(self, step: int, curves: Mapping[str, tuple[int, Sequence[float]]]) -> None:
+        """Write precision-recall curves for TensorBoard: (objects, precisions at recalls from 0 to 1) by name."""
+        for name, (objects, heights) in curves.items():
+            precision = np.clip(np.asarray(heights, dtype=np.float64), 1e-6, 1.0)
+            recall = np.linspace(0.0, 1.0, len(precision))
+            hits = recall * objects
+            false = hits * (1 - precision) / precision
+            counts = (hits, false, np.zeros_like(hits), objects - hits)
+            # TensorBoard's thresholds rise, so its recalls fall
+            rows = [values[::-1].copy() for values in (*counts, precision, recall)]
+            self._to_board(lambda board: board.add_pr_curve_raw(f"validation/{name}", *rows, step, len(precision)))  # noqa: B023
+
+    def picture(self, step: int, name: str, picture: Any) -> None:
+        """Write a picture (an image of Pillow) for TensorBoard."""
+        pixels = np.asarray(picture.convert("RGB"))  # (height, width, 3)
+        self._to_board(lambda board: board.add_image(f"validation/{name}", pixels, step, dataformats="HWC"))
+
+    def _to_board(self, write: Callable[[Any], None]) -> None:
+        if self._board is None:
+            return
+        try:
+            write(self._board)
+        except OSError as error:
+            self._warn_lost(error)
+
+    def _warn_lost(self, error: OSError) -> None:
+        if not self._lost:
+            self.info(f"warning: the log cannot be written ({error.strerror or error}); training goes on")
+        self._lost = True
+
     def info(self, text: str) -> None:
         """Print a line; a full disk behind the console is no reason to stop."""
         if not self.active:
@@ -136,9 +172,7 @@ class RunLog:
                 for name, value in values.items():
                     self._board.add_scalar(name, value, step)
         except OSError as error:
-            if not self._lost:
-                self.info(f"warning: the log cannot be written ({error.strerror or error}); training goes on")
-            self._lost = True
+            self._warn_lost(error)
 
     def close(self) -> None:
         """End the bar and close the files."""

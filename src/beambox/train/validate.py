@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+from PIL import Image
 
 from beambox.data.source import FrameSource, SubsetSource
+from beambox.detectors.contract import AnyModel
 from beambox.infer.evaluate import detect_frames, network, score_frames, score_once, scored_frames
 from beambox.metrics.kitti import KittiFrame
 from beambox.metrics.kitti_result import KittiResult
 from beambox.metrics.once_result import OnceResult
 from beambox.train.config import ValidationSection
 from beambox.train.preflight import check_validation
+from beambox.visualize.bev import draw_bev
 
 __all__ = ["Score", "Validator", "score_by", "summarize", "summarize_once"]
+
+
+PICTURES = 3
+"""Frames that each validation draws for TensorBoard."""
+SHOWN_SCORE = 0.3
+"""Detections below are not drawn."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,10 @@ class Score:
     """Numbers for the log."""
     table: dict[str, Any]
     """Everything, as ``beambox evaluate --json`` writes it."""
+    curves: Mapping[str, tuple[int, Sequence[float]]] = field(default_factory=dict)
+    """By class: number of objects, and the interpolated precision at recalls from 0 to 1 in even steps."""
+    frames: Sequence[KittiFrame] = ()
+    """What was scored, in the source's order."""
 
 
 class Validator:
@@ -47,7 +60,7 @@ class Validator:
         """
         self.section, self.source, self.dtype = section, source, dtype
 
-    def __call__(self, model: Any, rank: int = 0, processes: int = 1) -> Score:
+    def __call__(self, model: AnyModel, rank: int = 0, processes: int = 1) -> Score:
         """Score a detector; its training mode is restored.
 
         Args:
@@ -60,11 +73,21 @@ class Validator:
         mine = list(range(rank, len(self.source), processes))
         share = SubsetSource(self.source, mine) if processes > 1 else self.source
         frames = scored_frames(detect_frames(network(model, self.dtype), share))
-        result = score_by(section, gathered(frames, rank, processes), classes)
+        frames = gathered(frames, rank, processes)
+        result = score_by(section, frames, classes)
         score = summarize_once(result, section) if isinstance(result, OnceResult) else summarize(result, section)
         precision = str(self.dtype).removeprefix("torch.")
         table = {name: {**entry, "precision": precision} for name, entry in score.table.items()}
-        return replace(score, text=f"{score.text} ({precision})", table=table)
+        return replace(score, text=f"{score.text} ({precision})", table=table, frames=frames)
+
+    def pictures(self, score: Score) -> Iterator[tuple[str, Image.Image]]:
+        """Draw a few of the scored frames, the same each time, in BEV: detections beside the labels."""
+        count = min(PICTURES, len(score.frames))
+        for index in (len(score.frames) * k // count for k in range(count)):
+            frame, scored = self.source[index], score.frames[index]
+            found = scored.detections
+            found = found[found.scores >= SHOWN_SCORE]
+            yield frame.id, draw_bev(frame, found, scored.labels)
 
 
 def gathered(frames: Sequence[KittiFrame], rank: int, processes: int) -> Sequence[KittiFrame]:
@@ -99,7 +122,12 @@ def summarize(result: KittiResult, section: ValidationSection) -> Score:
     details = ", ".join(f"{name} {'-' if math.isnan(v) else f'{v:.2f}'}" for name, v in scalars.items())
     protocol = f"{section.view} {section.recalls} {result.levels[level]}"
     logged = {name: v for name, v in {**scalars, "mean": mean}.items() if not math.isnan(v)}
-    return Score(value, f"{protocol} {details}, mean {mean:.2f}", logged, result.to_json())
+    curves = {
+        one.name: (one.objects[level], averages.curve)
+        for one in result.classes
+        if (averages := (one.box3d if section.view == "3d" else one.bev)[level]).curve
+    }
+    return Score(value, f"{protocol} {details}, mean {mean:.2f}", logged, result.to_json(), curves)
 
 
 def summarize_once(result: OnceResult, section: ValidationSection) -> Score:
