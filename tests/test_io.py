@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from beambox import io
+from beambox import file_names, io
 from beambox.checks import BeamboxError, MissingFileError
 
 
@@ -38,7 +38,7 @@ def test_other_encodings_are_refused_by_name(tmp_path: Path, content: bytes, exp
 def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("000123\n", encoding="utf-8-sig")
     assert io.read_text(tmp_path / "a.txt") == "000123\n"
-    assert io.read_names(tmp_path / "a.txt") == ["000123"]
+    assert file_names.read_names(tmp_path / "a.txt") == ["000123"]
     (tmp_path / "a.json").write_text('{"a": 1}', encoding="utf-8-sig")
     assert io.read_json(tmp_path / "a.json") == {"a": 1}
 
@@ -106,22 +106,22 @@ def test_yaml_aliases_that_do_not_multiply_are_read() -> None:
 )
 def test_names_that_are_no_file_names_are_refused(name: object) -> None:
     with pytest.raises(BeamboxError, match=r"list\.txt: a name must be") as caught:
-        io.check_file_name(name, "list.txt")
+        file_names.check_file_name(name, "list.txt")
     assert "\x1b" not in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 250
 
 
 @pytest.mark.parametrize("name", ["000123", "n015-2018__LIDAR_TOP__15318.pcd", "2026-01-01 12.00", "Straße", "..a"])
 def test_plain_names_pass(name: str) -> None:
-    assert io.check_file_name(name, "list.txt") == name
+    assert file_names.check_file_name(name, "list.txt") == name
 
 
 def test_lists_name_each_frame_once_and_stay_in_their_folder(tmp_path: Path) -> None:
     for text, expected in (("", "is empty"), ("1 2 1", "names 1 again"), ("1\n../2", "plain file name")):
         (tmp_path / "val.txt").write_text(text, encoding="utf-8")
         with pytest.raises(BeamboxError, match=expected):
-            io.read_names(tmp_path / "val.txt")
+            file_names.read_names(tmp_path / "val.txt")
     with pytest.raises(MissingFileError):
-        io.read_names(tmp_path / "none.txt")
+        file_names.read_names(tmp_path / "none.txt")
 
 
 def test_a_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -234,10 +234,10 @@ def test_no_module_writes_past_the_one_writer() -> None:
     ],
 )
 def test_names_of_classes_survive_text_files(name: str) -> None:
-    word = io.name_to_word(name)
+    word = file_names.name_to_word(name)
     assert word.split() == [word] and word.isprintable() and not word.startswith("#") and word.lower() != "dontcare"
-    assert io.word_to_name(word) == name
-    assert io.name_to_word("Car") == "Car" and io.word_to_name("100%ABC") == "100%ABC"
+    assert file_names.word_to_name(word) == name
+    assert file_names.name_to_word("Car") == "Car" and file_names.word_to_name("100%ABC") == "100%ABC"
 
 
 def test_an_error_that_quotes_a_file_stays_short() -> None:

@@ -30,6 +30,8 @@ __all__ = [
     "expect_same_length",
     "expect_shape",
     "how_to_install",
+    "import_library",
+    "lacking",
     "printable",
 ]
 
@@ -189,7 +191,32 @@ def expect_library(name: str, extra: str, what: str) -> None:
         what: needs it, for the message.
     """
     if importlib.util.find_spec(name) is None:
-        raise BeamboxError(f"{what} needs the library {name}, which is not installed: {how_to_install(extra)}")
+        raise lacking(name, extra, what)
+
+
+def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any:
+    """Import an optional library, or a module of one.
+
+    Args:
+        name: of the module.
+        extra: of beambox, which installs it.
+        what: needs it, for the message.
+        otherwise: what one can do without it.
+
+    Raises:
+        BeamboxError: with the command that installs it, where it is absent.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise lacking(name, extra, what, otherwise) from None
+
+
+def lacking(name: str, extra: str, what: str, otherwise: str = "") -> BeamboxError:
+    """Return the error of an absent library; arguments as of :func:`import_library`."""
+    library = name.partition(".")[0].replace("_", "-")
+    hint = f"; {otherwise}" if otherwise else ""
+    return BeamboxError(f"{what} needs the library {library}, which is not installed: {how_to_install(extra)}{hint}")
 
 
 def how_to_install(extra: str) -> str:

@@ -118,20 +118,26 @@ def evaluate(  # noqa: PLR0913  # each is an option of the command too
     wanted = list(classes) if classes else list(detector.classes)
     check_classes(wanted, iou, by_once)
     found = _found(detector, model, source, data, keep, batch_size, score_threshold)
-    passing = _written(found, results)
+    passing, write_report = _written(found, results), None
     if report is not None:
         from beambox.report.build import after_evaluation
 
         passing, write_report = after_evaluation(Path(report), passing, source, wanted, by_once, levels)
     frames = scored_frames(track(passing, len(source), "detecting", progress))
-    if report is not None:
+    if write_report is not None:
         write_report(frames, model, detector, data, split)
     precision = str(detector.dtype).removeprefix("torch.")
     return evaluate_frames(frames, wanted, iou or ({},), by_once=by_once, levels=levels, precision=precision)
 
 
 def _found(
-    detector: Detector, model: Any, source: FrameSource, data: Any, keep: str | Path | None, batch: int, least: float
+    detector: Detector,
+    model: object,
+    source: FrameSource,
+    data: object,
+    keep: str | Path | None,
+    batch: int,
+    least: float,
 ) -> Iterator[tuple[Frame, Detections]]:
     """Detect, or take what was kept."""
     from beambox.infer.evaluate import detect_frames
@@ -309,7 +315,7 @@ def export(
     opset: int = 18,
     verify: str | Path | None = None,
 ) -> Written:
-    """Write PointPillars or HCNet as one ONNX file, after onnxruntime has computed from it what PyTorch computes.
+    """Write a detector of one stage as an ONNX file, after onnxruntime has computed from it what PyTorch computes.
 
     Args:
         model: a shipped name, a weight file, or the folder of a training run.

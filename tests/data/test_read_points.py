@@ -258,7 +258,9 @@ def test_coordinates_that_are_missing_are_named(tmp_path: Path) -> None:
 
 def test_an_absent_library_comes_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pypcd4", None)
-    with pytest.raises(BeamboxError, match=r'needs the library pypcd4: python -m pip install "\.\[formats\]"'):
+    with pytest.raises(
+        BeamboxError, match=r'needs the library pypcd4, which is not installed: python -m pip install "\.\[formats\]"'
+    ):
         library("pypcd4", Path("a.pcd"))
 
 

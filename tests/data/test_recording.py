@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
-from beambox.data.formats import columns
 from beambox.data.formats.recording import sweeps_in
 from beambox.data.read_points import read_frame
 from beambox.infer.inputs import find_sweeps, read_sweep
@@ -129,8 +128,11 @@ def test_what_cannot_be_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def absent(name: str) -> ModuleType:
         raise ImportError(name)
 
-    monkeypatch.setattr(columns.importlib, "import_module", absent)
-    with pytest.raises(BeamboxError, match=r'needs the library rosbags: python -m pip install "\.\[recordings\]"'):
+    monkeypatch.setattr("beambox.checks.importlib.import_module", absent)
+    with pytest.raises(
+        BeamboxError,
+        match=r'needs the library rosbags, which is not installed: python -m pip install "\.\[recordings\]"',
+    ):
         sweeps_in(path)
 
 

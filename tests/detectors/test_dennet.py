@@ -69,7 +69,7 @@ def test_each_switch_removes_exactly_its_parameters() -> None:
     for same in (
         {"na_position": AttentionPosition.MIDDLE},
         {"count_set": CountSet.POINTS},
-        {"normalisation": Normalization.RAW},
+        {"normalization": Normalization.RAW},
         {"max_count": 16},
     ):
         assert size_of(replace(FULL, **same)) == full
@@ -140,12 +140,12 @@ def test_density_reaches_the_map_beside_the_encoders() -> None:
 
 
 def test_options_are_read_as_plain_values() -> None:
-    options = {**config_to_dict(DENNET), "count_set": "points", "na_position": "middle", "normalisation": "log"}
+    options = {**config_to_dict(DENNET), "count_set": "points", "na_position": "middle", "normalization": "log"}
     model = build("dennet", options)
     assert isinstance(model, DenNet)
     assert model.config.count_set is CountSet.POINTS and model.config.na_position is AttentionPosition.MIDDLE
     with pytest.raises(BeamboxError, match=r"`normalization`: .*'log-share', 'log', 'share' or 'raw', got 'sqrt'"):
-        build("dennet", {"normalisation": "sqrt"})
+        build("dennet", {"normalization": "sqrt"})
 
 
 def test_wrong_options_are_refused() -> None:

@@ -75,5 +75,5 @@ def test_kam_learns_the_overlap_at_which_it_is_scored(name: str) -> None:
     config = build(recipe.detector.name, recipe.detector.options).config
     official = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
     scored = [recipe.validation.iou.get(of_class, official[of_class]) for of_class in config.classes]
-    taught = config.kam_options.fg_iou
+    taught = config.kam_options.positive_iou
     assert [*(taught * len(scored))[: len(scored)]] == scored

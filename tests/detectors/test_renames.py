@@ -97,7 +97,7 @@ def has(config: dict[str, Any], path: str) -> bool:
 
 
 def test_a_detector_from_outside_may_have_a_field_of_a_former_name() -> None:
-    own = {"columns": 3, "sampling": {"cls_bg_iou": 0.1}, "anchors": []}
-    options = {"columns": 5, "sampling": {"cls_bg_iou": 0.2, "cls_fg_iou": 0.9}, "anchors": [{"bottom": 1.0}]}
-    expected = {"columns": 5, "sampling": {"cls_bg_iou": 0.2, "cls_fg_iou": 0.9}, "anchors": [{"bottom_z": 1.0}]}
+    own = {"columns": 3, "sampling": {"score_low": 0.1}, "anchors": []}
+    options = {"columns": 5, "sampling": {"score_low": 0.2, "score_high": 0.9}, "anchors": [{"bottom": 1.0}]}
+    expected = {"columns": 5, "sampling": {"score_low": 0.2, "cls_fg_iou": 0.9}, "anchors": [{"bottom_z": 1.0}]}
     assert current_fields(options, own) == expected

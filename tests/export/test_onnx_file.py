@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -35,14 +35,17 @@ from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import KITTI_ANCHORS
 from oracles.command_line import beambox
 from oracles.paths import ROOT
-from oracles.small_detectors import HCNET, POINTPILLARS, SMALL, build_small, car_frame
+from oracles.small_detectors import HCNET, KASSD_CONFIG, POINTPILLARS, SECOND, SMALL, build_small, car_frame
 from oracles.tiny_detector import street, tiny_model
 
 ELSEWHERE = VoxelGrid((-10.24, -5.12, -3), (10.24, 5.12, 1), (0.32, 0.32, 4))
+SPARSE = ("second", "kassd")
 CASES: dict[str, tuple[str, Any, VoxelGrid | None, int]] = {
     "pointpillars": ("pointpillars", POINTPILLARS, None, 18),
     "hcnet": ("hcnet", HCNET, None, 20),
     "padded pillars elsewhere": ("pointpillars", replace(POINTPILLARS, empty_slots=True, max_points=4), ELSEWHERE, 23),
+    "second": ("second", replace(SECOND, anchors=KITTI_ANCHORS[:2]), None, 18),
+    "kassd": ("kassd", replace(KASSD_CONFIG, anchors=KITTI_ANCHORS), None, 19),
 }
 
 
@@ -58,6 +61,10 @@ def shaken(model: Any, seed: int = 0) -> Any:
     for layer in (model.head.cls, model.head.box, model.head.direction):
         layer.weight.data.copy_(0.1 * torch.randn(layer.weight.shape, generator=generator))
         layer.bias.data.zero_()
+    if getattr(model, "kam", None) is not None:
+        last = model.kam.maps[-1]
+        last.weight.data.copy_(0.3 * torch.randn(last.weight.shape, generator=generator))
+        last.bias.data.zero_()
     return model.eval()
 
 
@@ -120,6 +127,7 @@ class Looking:
 
     def __init__(self, exported: Exported) -> None:
         self.exported = exported
+        self.config = exported.config
 
     def __call__(self, batch: Any, grid: VoxelGrid | None = None) -> Any:
         assert grid == (self.exported.grid or self.exported.config.grid), "the metadata tell the region"
@@ -160,18 +168,21 @@ def test_one_file_with_everything_inside(exported: Exported) -> None:
 
 
 def test_inputs_and_outputs_are_named_and_of_any_length(exported: Exported) -> None:
-    anchors, classes = len(exported.model.anchors.boxes(exported.grid or exported.config.grid)), 1
+    anchors = len(exported.model.anchors.boxes(exported.grid or exported.config.grid))
+    rows = min(anchors, exported.config.kam_options.test_boxes) if exported.name == "kassd" else anchors
+    classes = len(exported.config.classes)
     assert exported.written.inputs == {"points": "(N, 4) float32", "voxel": "(N) int64", "index": "(V, 3) int64"}
     assert exported.written.outputs == {
-        "boxes": f"({anchors}, 7) float32",
-        "scores": f"({anchors}, {classes}) float32",
+        "boxes": f"({rows}, 7) float32",
+        "scores": f"({rows}, {classes}) float32",
     }
 
 
 def test_rows_are_never_scattered_whole(exported: Exported) -> None:
     """With onnxruntime's threads, rows that ScatterND brings to one place are lost now and then."""
     kinds = {node.op_type for node in onnx.load(exported.path).graph.node}
-    assert "ScatterElements" in kinds and not kinds & {"ScatterND", "Unique", "NonZero"}
+    assert "ScatterElements" in kinds and not kinds & {"ScatterND", "Unique"}
+    assert ("NonZero" in kinds) == (exported.name in SPARSE), "sizes of dense networks are known before values"
 
 
 def test_metadata_hold_the_configuration(exported: Exported) -> None:
@@ -180,9 +191,13 @@ def test_metadata_hold_the_configuration(exported: Exported) -> None:
         exported.grid or exported.config.grid
     )
     assert config_from_dict(CATALOG[about["detector"]].config, about["config"]) == exported.config
-    assert about["detector"] == exported.name and about["classes"] == ["Car"] and about["card"] == {"name": "small"}
+    assert (
+        about["detector"] == exported.name
+        and about["classes"] == list(exported.config.classes)
+        and about["card"] == {"name": "small"}
+    )
     assert about["cells"] == list((exported.grid or exported.config.grid).size)
-    assert about["post"] == {"score_threshold": 0.1, "nms_iou": 0.01, "nms_pre": 4096, "nms_post": 500}
+    assert about["post"] == asdict(exported.config.post)
     assert about["max_points"] == exported.config.max_points and about["max_voxels"] in (40000, 60000)
 
 
@@ -225,10 +240,11 @@ def test_nan_and_large_differences_do_not_agree(scores: float, boxes: float) -> 
 # --- refusals ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted(SMALL.keys() - {"pointpillars", "hcnet"}))
-def test_sparse_detectors_are_refused(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", sorted(SMALL.keys() - {"pointpillars", "hcnet", "second", "kassd"}))
+def test_detectors_with_two_stages_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(
-        BeamboxError, match=f"^{name} cannot be exported: .*sparse conv.*pointpillars and hcnet can be$"
+        BeamboxError,
+        match=f"^{name} cannot be exported: its second stage .*pointpillars, hcnet, second and kassd can be$",
     ):
         export_onnx(build_small(name), tmp_path / "x.onnx")
     assert not list(tmp_path.iterdir())
@@ -305,7 +321,9 @@ def test_a_file_that_differs_is_not_written_and_the_old_one_stays(no_tracing: Ex
 
 def test_a_missing_package_is_told_with_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_file, "find_spec", lambda name: None)
-    with pytest.raises(BeamboxError, match=r'needs onnx and onnxscript: python -m pip install "\.\[export\]"'):
+    with pytest.raises(
+        BeamboxError, match=r'needs the library onnx, which is not installed: python -m pip install "\.\[export\]"'
+    ):
         export_onnx(build_small("pointpillars"), tmp_path / "m.onnx")
 
 
@@ -315,7 +333,10 @@ def test_without_onnxruntime_the_file_is_written_unless_a_sweep_is_given(
     monkeypatch.setattr(onnx_file, "runtime_is_there", lambda: False)
     written: Written = export_onnx(no_tracing.model, tmp_path / "m.onnx")
     assert written.checks == () and written.path.is_file()
-    with pytest.raises(BeamboxError, match=r'comparing needs onnxruntime: python -m pip install "\.\[export\]"'):
+    with pytest.raises(
+        BeamboxError,
+        match=r'comparing needs the library onnxruntime, which is not installed: python -m pip install "\.\[export\]"',
+    ):
         export_onnx(no_tracing.model, tmp_path / "n.onnx", sweeps={"s": torch.zeros(1, 4)})
     assert not (tmp_path / "n.onnx").exists()
 
@@ -342,14 +363,19 @@ def test_the_command_and_the_example_of_its_page(
 
     wanted = Detector(model, precision="float32", device="cpu")("scan.bin")
     assert len(namespace["keep"]) == len(wanted) > 5
-    torch.testing.assert_close(namespace["boxes"][namespace["keep"]], wanted.boxes, atol=1e-3, rtol=1e-4)
+    boxes, score = (namespace[name][namespace["keep"]] for name in ("boxes", "score"))
+    torch.testing.assert_close(score, wanted.scores, atol=1e-4, rtol=0)
+    same = torch.cdist(wanted.boxes, boxes).argmin(dim=1)  # scores that differ in the seventh digit may change places
+    assert sorted(same.tolist()) == list(range(len(boxes)))
+    assert ((score[same] - wanted.scores).abs() < 1e-5).all()
+    torch.testing.assert_close(boxes[same], wanted.boxes, atol=1e-3, rtol=1e-4)
     assert capsys.readouterr().out.count("\n") == len(wanted)
 
 
 def test_the_command_refuses_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    save_weights(tmp_path / "second.safetensors", build_small("second"))
-    ran = beambox(capsys, "export", tmp_path / "second.safetensors", "--out", tmp_path / "x.onnx")
-    assert ran.status == 2 and ran.err.splitlines()[-1].startswith("beambox: second cannot be exported")
+    save_weights(tmp_path / "voxel_rcnn.safetensors", build_small("voxel_rcnn"))
+    ran = beambox(capsys, "export", tmp_path / "voxel_rcnn.safetensors", "--out", tmp_path / "x.onnx")
+    assert ran.status == 2 and ran.err.splitlines()[-1].startswith("beambox: voxel_rcnn cannot be exported")
     assert not (tmp_path / "x.onnx").exists()
 
 
@@ -363,5 +389,7 @@ def test_the_command_leaves_no_file_where_the_comparison_fails(
 
 
 def test_metadata_are_plain_json(pillars: Exported) -> None:
-    (prop,) = onnx.load(pillars.path).metadata_props
-    assert prop.key == "beambox" and json.loads(prop.value)["format"] == "beambox-onnx-1"
+    values = {prop.key: prop.value for prop in onnx.load(pillars.path).metadata_props}
+    assert json.loads(values["beambox"])["format"] == "beambox-onnx-1"
+    plain = dict(line.split(" ", 1) for line in values["beambox-plain"].splitlines())
+    assert plain["class"] == "Car" and plain["cells"] == "64 64 1" and plain["nms_iou"] == "0.01"

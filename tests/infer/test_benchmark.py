@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from beambox.checks import BeamboxError
+from beambox.infer import peaks
 from beambox.infer.benchmark import STAGES, Report, measure, summary, untrained
 from beambox.infer.predictor import load
 from oracles.command_line import beambox
@@ -51,6 +52,20 @@ def test_json_says_what_was_measured_on_what(report: Report) -> None:
     }
     assert output == expected
     assert content["torch"] == torch.__version__ and content["device"] and content["peak_memory_mb"] > 10
+
+
+def test_stages_share_the_whole_and_stand_beside_the_machines_best(report: Report) -> None:
+    content = report.to_json()
+    assert sum(stage["share"] for stage in content["stages"].values()) == pytest.approx(1.0, abs=1e-3)
+    assert set(content["machine"]) == {"convolution_gflops", "product_gflops", "copy_gbs"}
+    assert all(value > 0.1 for value in content["machine"].values())
+    assert "this machine at best: convolution" in report.table() and "%" in report.table()
+
+
+def test_peaks_are_work_by_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peaks, "shortest", lambda run, device: 0.5)
+    found = peaks.machine_peaks(torch.device("cpu"), torch.float32)
+    assert found == {"convolution_gflops": 9.7, "product_gflops": 4.3, "copy_gbs": 0.3}
 
 
 def test_tables_name_every_part(report: Report) -> None:

@@ -14,9 +14,9 @@ OPS = ROOT / "src" / "beambox" / "ops"
 FOLDERS = sorted(path.parent.name for path in OPS.glob("*/__init__.py"))
 DOORS = {"sparse_conv": "sparse_conv3d", "find_targets": "kernel_map"}
 """Functions that users call, where the choice of a backend has another name."""
-NO_CHOICE = {"linear_keys"}
-PART_OF = {"backends": "TARGET_BACKENDS"}
-"""Lists that a size may shorten at run time, by the name of the variable."""
+NO_CHOICE = {"linear_keys", "learning_ground", "pooled"}
+PART_OF = {"backends": "TARGET_BACKENDS", "able": "BACKENDS", "pooling": "POOLED_BACKENDS"}
+"""Lists that a size or type may shorten at run time, by the name of the variable."""
 
 
 def rows() -> dict[str, list[str]]:

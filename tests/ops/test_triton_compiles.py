@@ -131,7 +131,7 @@ def test_kernel_maps_compile():
 def test_voxel_query_compiles(values):
     from beambox.ops.voxel_query import gpu
 
-    sizes = ("count", "sites", "steps", "nb", "nz", "ny", "nx", "rz", "ry", "rx", "samples")
+    sizes = ("count", "sites", "steps", "nb", "nz", "ny", "nx", "rz", "ry", "rx", "max_samples")
     compile_kernel(
         gpu._search, points=values, cells="*i64", centers=values, keys="*i64", order="*i64", found="*i64", limit=values,
         **dict.fromkeys(sizes, "i32"), block=gpu.BLOCK,

@@ -7,7 +7,7 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.ops.sparse_conv import Sites
-from beambox.ops.voxel_query import voxel_query
+from beambox.ops.voxel_query import pooled_query, voxel_query
 from oracles.sparse_conv import random_sparse
 from oracles.voxel_query import query_by_loops
 
@@ -65,3 +65,40 @@ def test_voxel_query_refuses_what_makes_no_sense():
         voxel_query(points, cells, sites, centers, (1, 1, 1), 0.0, 4)
     with pytest.raises(BeamboxError, match=r"`centers` must have shape"):
         voxel_query(points, cells, sites, centers[:1], (1, 1, 1), 1.0, 4)
+
+
+@pytest.mark.parametrize("channels", [1, 7, 32])
+@pytest.mark.parametrize("density", [0.02, 0.3])
+def test_pooling_at_once_is_search_gather_and_maximum(backend, density, channels):
+    points, cells, sites, centers = scene(3, density)
+    torch.manual_seed(channels)
+    features, weight, bias = torch.randn(len(sites), channels), torch.randn(channels, 3), torch.randn(channels)
+    where = (points.float(), cells, sites, centers.float(), (2, 2, 2), 0.8, 5)
+    ours = pooled_query(*where, features, weight, bias)
+    found = voxel_query(*where)
+    assert (found < 0).any() and (found >= 0).any()
+    for m, rows in enumerate(found.tolist()):
+        values = [features[v] + weight @ (where[3][v] - where[0][m]) + bias for v in rows if v >= 0] or [bias]
+        torch.testing.assert_close(ours[m], torch.stack(values).amax(0).relu(), rtol=0, atol=1e-5)
+
+
+def test_pooling_nothing_gives_the_bias(backend):
+    points, cells, sites, centers = scene(0, 0.0)
+    out = pooled_query(
+        points.float(), cells, sites, centers.float(), (1, 1, 1), 1.0, 2, torch.zeros(len(sites), 3), torch.ones(3, 3),
+        torch.tensor([-1.0, 0.0, 2.0]),
+    )  # fmt: skip
+    assert len(sites) == 0 and torch.equal(out, torch.tensor([0.0, 0.0, 2.0]).expand(len(points), 3))
+
+
+def test_pooling_keeps_a_nan_and_gives_gradients(backend):
+    points, cells, sites, centers = scene(3, 0.3)
+    features = torch.randn(len(sites), 4)
+    features[:, 2] = torch.nan
+    where = (points.float(), cells, sites, centers.float(), (2, 2, 2), 0.8, 5)
+    weight = torch.randn(4, 3)
+    some = (voxel_query(*where) >= 0).any(dim=1)
+    assert pooled_query(*where, features, weight, torch.zeros(4))[some][:, 2].isnan().all()
+    weight.requires_grad_()
+    pooled_query(*where, features.nan_to_num(1.0), weight, torch.zeros(4)).sum().backward()
+    assert weight.grad is not None and weight.grad.abs().sum() > 0

@@ -17,7 +17,13 @@ def test_a_missing_column_is_named() -> None:
 
 
 def test_a_detector_of_five_columns_refuses_four() -> None:
-    options = {"columns": 5, "voxel_channels": 8, "widths": [8, 8, 8], "up_widths": [8, 8, 8], "depths": [1, 1, 1]}
+    options = {
+        "num_point_features": 5,
+        "voxel_channels": 8,
+        "widths": [8, 8, 8],
+        "up_widths": [8, 8, 8],
+        "depths": [1, 1, 1],
+    }
     detector = Detector(build("pointpillars", options))
     points = torch.rand(50, 4) * torch.tensor([40.0, 20.0, 1.0, 1.0])
     with pytest.raises(BeamboxError, match="sweep four has 4"):

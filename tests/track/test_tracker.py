@@ -160,7 +160,9 @@ def test_what_cannot_be_tracked_is_refused() -> None:
 
 def test_without_the_library_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "filterpy.kalman", None)
-    with pytest.raises(BeamboxError, match=r'needs the library filterpy: python -m pip install "\.\[track\]"'):
+    with pytest.raises(
+        BeamboxError, match=r'needs the library filterpy, which is not installed: python -m pip install "\.\[track\]"'
+    ):
         Tracker()
 
 

@@ -15,7 +15,7 @@ from beambox.train.devices import choose_precision, make_fabric
 def test_auto_takes_bfloat16_only_where_it_is_native() -> None:
     import torch
 
-    reason = bfloat16_reason(torch.device("cpu"))
+    reason = bfloat16_reason(torch.device("cpu"), training=True)
     assert choose_precision("auto", "cpu") == ("float32" if reason else "bfloat16")
     assert choose_precision("bfloat16", "cpu") == "bfloat16"
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from beambox.checks import BeamboxError
 from beambox.cli import options
 from beambox.cli.console import announce, log, progress, show_log
+from beambox.cli.detector_options import DetectorOptions, takes_detector_options
 
 if TYPE_CHECKING:
     from beambox.infer.inputs import Sweep
-    from beambox.infer.jobs import Job
+    from beambox.infer.jobs import Job, Tally
     from beambox.infer.predictor import Detector
     from beambox.structures import Detections, Frame
 
@@ -27,7 +28,8 @@ REACH = 75.0
 """Points farther than this to a side are no loss, metres."""
 
 
-def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+@takes_detector_options
+def command(  # each is an option of the command line
     inputs: options.InputsArgument,
     model: options.DefaultModelOption = "",
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
@@ -37,18 +39,14 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         str, typer.Option("--format", "-f", metavar="F", help="json, csv, kitti, jsonl, parquet.")
     ] = "json",
     score_threshold: options.ScoreThresholdOption = 0.0,
-    range_: options.RangeOption = "",
-    view: options.ViewOption = "auto",
-    sensor_height: options.HeightOption = None,
-    axes: options.AxesOption = "",
-    ground_slope: options.SlopeOption = "",
-    intensity_scale: options.IntensityOption = None,
-    fields: options.FieldsOption = "",
-    device: options.DeviceOption = "auto",
-    precision: options.PrecisionOption = "auto",
     skip_existing: Annotated[bool, typer.Option("--skip-existing", help="Leave out sweeps that are done.")] = False,
     shard: Annotated[str, typer.Option(metavar="I/N", help="Do the I-th of N parts, as on machine I of N.")] = "1/1",
     workers: Annotated[int, typer.Option(min=1, max=1024, metavar="W", help="Processes, of one thread each.")] = 1,
+    ray: Annotated[
+        int, typer.Option(min=0, max=100_000, metavar="N", help="Do N parts as tasks of a Ray cluster.")
+    ] = 0,
+    *,
+    how: DetectorOptions,
 ) -> None:
     """Find objects in sweeps; writes one result file per sweep.
 
@@ -65,7 +63,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     from beambox.zoo import DEFAULT
 
     options.expect_there(inputs, model)
-    parsed_range, slope = options.parse_range(range_), options.parse_slope(ground_slope)
+    chosen = how.for_load()
     if not model:
         model = DEFAULT
         log(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
@@ -79,17 +77,9 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     sweeps = find_sweeps(inputs)
     if "kitti" in kinds:
         need_calibration(sweeps)
-    chosen: dict[str, Any] = {
-        "device": device,
-        "precision": precision,
-        "range": parsed_range,
-        "view": view,
-        "sensor_height": sensor_height,
-        "axes": axes or None,
-        "ground_slope": slope,
-        "intensity_scale": intensity_scale,
-        "fields": fields or None,
-    }
+    if ray:
+        detect_on_ray(sweeps, Job(model, chosen, out, kinds, score_threshold, part), ray, skip_existing, workers)
+        return
     if skip_existing or workers > 1 or part != (0, 1) or set(kinds) & set(TABLES):
         job = Job(model, chosen, out, kinds, score_threshold, part)
         detect_many(sweeps, job, workers, skip_existing)
@@ -106,7 +96,25 @@ def detect_many(sweeps: list[Sweep], job: Job, workers: int, skip_existing: bool
     start = time.perf_counter()
     announce("detect", detail=f"{job.model}, shard {job.shard[0] + 1}/{job.shard[1]}, {workers} workers")
     tally = run_job(sweeps, job, workers, skip_existing=skip_existing)
-    seconds = time.perf_counter() - start
+    sum_up(tally, job, time.perf_counter() - start, workers)
+
+
+def detect_on_ray(sweeps: list[Sweep], job: Job, parts: int, skip_existing: bool, workers: int) -> None:
+    """Detect in all sweeps as tasks of Ray."""
+    from beambox.infer.on_ray import need_ray, run_on_ray
+
+    if job.shard != (0, 1) or workers > 1:
+        raise BeamboxError("--ray makes parts and processes of its own: leave out --shard and --workers")
+    need_ray()
+    start = time.perf_counter()
+    announce("detect", detail=f"{job.model}, {parts} parts on Ray")
+    gpus = 1 if str(job.options["device"]).startswith("cuda") else 0
+    tally = run_on_ray(sweeps, job, parts, skip_existing=skip_existing, gpus=gpus)
+    sum_up(tally, job, time.perf_counter() - start, parts)
+
+
+def sum_up(tally: Tally, job: Job, seconds: float, workers: int) -> None:
+    """Tell what was done; status 2 where sweeps could not be read."""
     for fault in tally.faults:
         log(f"beambox: skipped: {fault}")
     rate = tally.sweeps / seconds / workers if seconds else 0.0

@@ -9,21 +9,19 @@ import typer
 
 from beambox.cli import options
 from beambox.cli.console import show_log
+from beambox.cli.detector_options import DetectorOptions, takes_detector_options
 
 __all__ = ["command"]
 
 
+@takes_detector_options
 def command(  # each is an option of the command line
     model: options.ModelArgument,
     inputs: options.InputsArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path("explained"),
     score_threshold: options.ScoreThresholdOption = 0.3,
-    range_: options.RangeOption = "",
-    view: options.ViewOption = "auto",
-    sensor_height: options.HeightOption = None,
-    fields: options.FieldsOption = "",
-    intensity_scale: options.IntensityOption = None,
-    device: options.DeviceOption = "auto",
+    *,
+    how: DetectorOptions,
 ) -> None:
     """Draw what HCNet, KASSD or DenNet weighs in sweeps.
 
@@ -33,9 +31,11 @@ def command(  # each is an option of the command line
     HCNet: the weights of height slices and channels. KASSD: the weights of places and the scores of keypoints. DenNet:
     the densities of voxels, and what the surest boxes attend to.
     """
-    from beambox.checks import expect_library
+    from beambox.checks import BeamboxError, expect_library
 
     expect_library("matplotlib", "plots", "drawing what a detector weighs")
+    if how.precision not in ("auto", "float32"):
+        raise BeamboxError(f"weights are explained in float32; leave out --precision, got {how.precision}")
     options.expect_there(inputs, model)
 
     from beambox.explain.pictures import explain
@@ -45,16 +45,7 @@ def command(  # each is an option of the command line
 
     show_log()
     sweeps = find_sweeps(inputs)
-    detector = load(
-        model,
-        device=device,
-        precision="float32",
-        range=options.parse_range(range_),
-        view=view,  # pyright: ignore[reportArgumentType]  # load checks it
-        sensor_height=sensor_height,
-        fields=fields or None,
-        intensity_scale=intensity_scale,
-    )
+    detector = load(model, **{**how.for_load(), "precision": "float32"})
     for sweep in sweeps:
         for one in explain(detector, detector.read(sweep), score_threshold):
             path = out / f"{sweep.name}_{one.name}.png"

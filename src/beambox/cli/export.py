@@ -23,7 +23,7 @@ def command(
     ] = "",
     range_: options.RangeOption = "",
 ) -> None:
-    """Write PointPillars or HCNet as one ONNX file, weights and settings inside.
+    """Write PointPillars, HCNet, SECOND or KASSD as one ONNX file, weights and settings inside.
 
     The file takes points gathered into voxels and gives boxes and scores of all anchors; docs/export.md says how both
     ends are done. It is written only if onnxruntime computes from it what PyTorch computes.

@@ -30,5 +30,5 @@ def command(
     detector = import_checkpoint(checkpoint, model)
     card = {"imported_from": f"OpenPCDet checkpoint {checkpoint.name}"}
     save_weights(out, detector, card)
-    classes = ", ".join(getattr(detector, "config").classes)  # noqa: B009
+    classes = ", ".join(detector.config.classes)
     print(f"{out}: {model} ({classes}) from {checkpoint}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from beambox.checks import expect_library
 from beambox.cli.options import DeviceOption, PrecisionOption, RangeOption, ViewOption, expect_there, parse_range
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
 
     A folder of results holds one file per frame: .json or .csv of `beambox detect`, or KITTI's .txt.
     """
+    expect_library("matplotlib", "plots", "a report")
     expect_there([data])
     for name in (given, against):
         expect_there([], name if not Path(name).is_dir() else "")

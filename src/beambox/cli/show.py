@@ -12,6 +12,7 @@ import typer
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.cli import options
 from beambox.cli.console import progress, show_log
+from beambox.cli.detector_options import DetectorOptions, takes_detector_options
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+@takes_detector_options
+def command(  # noqa: PLR0913  # each is an option of the command line
     inputs: Annotated[
         list[str],
         typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns, recordings; or a data set (YAML)."),
@@ -51,15 +53,8 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     frames: Annotated[int, typer.Option(min=0, help="Only the first so many sweeps; 0: all.")] = 0,
     rate: Annotated[float, typer.Option(help="Sweeps per second of films and of a page's time line.")] = 5.0,
     score_threshold: options.ScoreThresholdOption = 0.3,
-    range_: options.RangeOption = "",
-    view: options.ViewOption = "auto",
-    sensor_height: options.HeightOption = None,
-    axes: options.AxesOption = "",
-    ground_slope: options.SlopeOption = "",
-    intensity_scale: options.IntensityOption = None,
-    fields: options.FieldsOption = "",
-    device: options.DeviceOption = "auto",
-    precision: options.PrecisionOption = "auto",
+    *,
+    how: DetectorOptions,
 ) -> None:
     """Draw sweeps in BEV, with boxes, and the boxes into the camera image; no display is needed.
 
@@ -83,26 +78,14 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     from beambox.geometry.axes import Axes
 
     show_log()
-    turned = Axes.parse(axes) if axes else Axes()
+    turned = Axes.parse(how.axes) if how.axes else Axes()
     shown = region_of_option(area)
     source = show_inputs.data_set_of(inputs, split)
     sweeps = show_inputs.sweeps_of(
-        inputs, source, names, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
+        inputs, source, names, frames, fields=how.fields, intensity_scale=how.intensity_scale, labels=not labels
     )
     paths = picture_paths(sweeps, out)
-    detector = show_inputs.detector_for(
-        model,
-        source,
-        device=device,
-        precision=precision,
-        range=options.parse_range(range_),
-        view=view,
-        sensor_height=sensor_height,
-        axes=turned,
-        ground_slope=options.parse_slope(ground_slope),
-        intensity_scale=intensity_scale,
-        fields=fields or None,
-    )
+    detector = show_inputs.detector_for(model, source, **how.for_load())
 
     def scenes() -> Iterator[Scene]:
         for sweep in progress(sweeps, len(sweeps), "Drawing"):

@@ -10,6 +10,7 @@ import typer
 from beambox.checks import BeamboxError
 from beambox.cli import options
 from beambox.cli.console import announce, log, show_log
+from beambox.cli.detector_options import DetectorOptions, takes_detector_options
 
 if TYPE_CHECKING:
     from beambox.infer.predictor import Detector
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+@takes_detector_options
+def command(  # each is an option of the command line
     source: Annotated[
         Path, typer.Argument(metavar="INPUT", help="Recording (.mcap, .bag, .db3), or folder of sweeps.")
     ],
@@ -29,15 +31,8 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     speed: Annotated[float, typer.Option(metavar="X", help="With --realtime: play X times as fast.")] = 1.0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Sweeps per second of a folder.")] = 10.0,
     score_threshold: options.ScoreThresholdOption = 0.1,
-    range_: options.RangeOption = "",
-    view: options.ViewOption = "auto",
-    sensor_height: options.HeightOption = None,
-    axes: options.AxesOption = "",
-    ground_slope: options.SlopeOption = "",
-    intensity_scale: options.IntensityOption = None,
-    fields: options.FieldsOption = "",
-    device: options.DeviceOption = "auto",
-    precision: options.PrecisionOption = "auto",
+    *,
+    how: DetectorOptions,
 ) -> None:
     """Detect and track through a recording, read once; boxes keep its stamps and frame ids.
 
@@ -67,18 +62,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         tracker = Tracker(
             TrackerOptions(score_threshold=score_threshold, birth_score=max(0.3, score_threshold)), rate=rate
         )
-    detector = load(
-        model,
-        device=device,
-        precision=precision,
-        range=options.parse_range(range_),
-        view=view,  # pyright: ignore[reportArgumentType]  # load checks it
-        sensor_height=sensor_height,
-        axes=axes or None,
-        ground_slope=options.parse_slope(ground_slope),
-        intensity_scale=intensity_scale,
-        fields=fields or None,
-    )
+    detector = load(model, **how.for_load())
     announce("stream", detail=f"{model} on {detector.device} in {str(detector.dtype).removeprefix('torch.')}")
     settings = {
         "model": model,
@@ -87,9 +71,10 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         "track": track,
         "score_threshold": score_threshold,
     }
-    settings |= {"range": range_, "view": view, "sensor_height": sensor_height, "axes": axes, "precision": precision}
+    settings |= {"range": how.range_, "view": how.view, "sensor_height": how.sensor_height, "axes": how.axes}
+    settings |= {"precision": how.precision}
     dropped: list[str] = []
-    sweeps = arrivals(source, topic, rate=rate, fields=fields or None, intensity_scale=intensity_scale)
+    sweeps = arrivals(source, topic, rate=rate, fields=how.fields or None, intensity_scale=how.intensity_scale)
     if realtime:
         warm_up(detector)
         sweeps = in_real_time(sweeps, lambda sweep: dropped.append(sweep.name), speed=speed)

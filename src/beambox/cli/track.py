@@ -12,6 +12,7 @@ import typer
 from beambox.checks import BeamboxError
 from beambox.cli import options
 from beambox.cli.console import announce, log, progress, show_log
+from beambox.cli.detector_options import DetectorOptions, takes_detector_options
 
 if TYPE_CHECKING:
     from beambox.geometry import Calibration
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+@takes_detector_options
+def command(  # noqa: PLR0913  # each is an option of the command line
     inputs: Annotated[list[str] | None, typer.Argument(metavar="[INPUT]...", help="Sweeps of one drive.")] = None,
     model: Annotated[str, typer.Option("--model", "-m", metavar="M", help="Detect with these weights.")] = "",
     results: Annotated[
@@ -41,13 +43,8 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     confirm_score: Annotated[float, typer.Option(metavar="S", help="Report tracks from this mean score on.")] = 0.5,
     score_threshold: options.ScoreThresholdOption = 0.1,
     coast: Annotated[float, typer.Option(metavar="S", help="Seconds to report a track without detection.")] = 0.0,
-    range_: options.RangeOption = "",
-    view: options.ViewOption = "auto",
-    sensor_height: options.HeightOption = None,
-    axes: options.AxesOption = "",
-    fields: options.FieldsOption = "",
-    device: options.DeviceOption = "auto",
-    precision: options.PrecisionOption = "auto",
+    *,
+    how: DetectorOptions,
 ) -> None:
     """Track objects through a drive: one identity each, velocities, births and deaths.
 
@@ -84,16 +81,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     else:
         from beambox.infer.predictor import load
 
-        detector = load(
-            model,
-            device=device,
-            precision=precision,
-            range=options.parse_range(range_),
-            view=view,  # pyright: ignore[reportArgumentType]  # load checks it
-            sensor_height=sensor_height,
-            axes=axes or None,
-            fields=fields or None,
-        )
+        detector = load(model, **how.for_load())
         steps = detect_steps(detector, sweeps)
     total = len(steps) if isinstance(steps, list) else len(sweeps)
     times = stamps_of([sweep.name for sweep in sweeps]) if sweeps else None

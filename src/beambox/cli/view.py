@@ -9,11 +9,13 @@ import typer
 
 from beambox.cli import options
 from beambox.cli.console import progress, show_log
+from beambox.cli.detector_options import DetectorOptions, takes_detector_options
 
 __all__ = ["command"]
 
 
-def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
+@takes_detector_options
+def command(  # each is an option of the command line
     inputs: Annotated[
         list[str],
         typer.Argument(metavar="INPUT", help="Sweeps: files, folders, patterns, recordings; or a data set (YAML)."),
@@ -32,13 +34,8 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     frames: Annotated[int, typer.Option(min=0, help="Only the first so many sweeps; 0: all.")] = 0,
     rate: Annotated[float, typer.Option(help="Sweeps per second of the time line.")] = 10.0,
     score_threshold: options.ScoreThresholdOption = 0.3,
-    range_: options.RangeOption = "",
-    view: options.ViewOption = "auto",
-    sensor_height: options.HeightOption = None,
-    fields: options.FieldsOption = "",
-    intensity_scale: options.IntensityOption = None,
-    device: options.DeviceOption = "auto",
-    precision: options.PrecisionOption = "auto",
+    *,
+    how: DetectorOptions,
 ) -> None:
     """Open sweeps in rerun (extra `rerun`): points, boxes with scores, camera, ground truth, a time line.
 
@@ -62,19 +59,9 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
     import_rerun()
     source = show_inputs.data_set_of(inputs, split)
     sweeps = show_inputs.sweeps_of(
-        inputs, source, names, frames, fields=fields, intensity_scale=intensity_scale, labels=not labels
+        inputs, source, names, frames, fields=how.fields, intensity_scale=how.intensity_scale, labels=not labels
     )
-    detector = show_inputs.detector_for(
-        model,
-        source,
-        device=device,
-        precision=precision,
-        range=options.parse_range(range_),
-        view=view,
-        sensor_height=sensor_height,
-        intensity_scale=intensity_scale,
-        fields=fields or None,
-    )
+    detector = show_inputs.detector_for(model, source, **how.for_load())
     log = RerunLog(out, color_by="height" if color == "height" else "intensity")
     for number, sweep in enumerate(progress(sweeps, len(sweeps), "Detecting" if model else "Reading")):
         read, scores = sweep.read(), None

@@ -33,8 +33,9 @@ from beambox.data import kitti_text
 from beambox.data.labels.catalog import FORMATS, parse_labels
 from beambox.data.labels.tables import DEGREES
 from beambox.data.labels.tables import SYNONYMS as ALIASES
+from beambox.file_names import word_to_name
 from beambox.geometry.calibration import Calibration
-from beambox.io import parse_json, word_to_name
+from beambox.io import parse_json
 
 __all__ = [
     "CAMERA_AT_THE_SENSOR",

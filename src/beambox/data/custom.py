@@ -28,9 +28,10 @@ from beambox.data.ground_plane import fit_ground_plane
 from beambox.data.kitti_calibration import read_calibration
 from beambox.data.names import NameList
 from beambox.data.read_points import read_shifted
+from beambox.file_names import read_names
 from beambox.geometry.axes import Axes, turn_boxes
 from beambox.geometry.boxes import wrap_angle
-from beambox.io import read_names, read_text
+from beambox.io import read_text
 from beambox.ops.points_in_boxes import points_in_boxes_mask
 from beambox.structures import Frame, Labels
 

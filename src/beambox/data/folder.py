@@ -24,7 +24,8 @@ import torch
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.box_files import box_words
 from beambox.data.read_points import read_frame, readable_suffixes
-from beambox.io import name_to_word, read_names, read_text
+from beambox.file_names import name_to_word, read_names
+from beambox.io import read_text
 from beambox.structures import Frame, Labels
 
 __all__ = ["FolderSource", "format_boxes", "parse_boxes"]

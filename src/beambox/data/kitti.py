@@ -39,8 +39,9 @@ from beambox.data.kitti_text import (
     read_results,
 )
 from beambox.data.read_points import read_frame
+from beambox.file_names import check_file_name, read_names
 from beambox.geometry import Calibration
-from beambox.io import check_file_name, read_names, read_text, write_bytes, write_text
+from beambox.io import read_text, write_bytes, write_text
 from beambox.structures import Frame, Labels
 
 __all__ = [

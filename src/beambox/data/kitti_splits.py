@@ -11,7 +11,8 @@ import base64
 from pathlib import Path
 
 from beambox.checks import BeamboxError, MissingFileError
-from beambox.io import read_names, write_text
+from beambox.file_names import read_names
+from beambox.io import write_text
 
 __all__ = ["kitti_splits", "write_kitti_splits"]
 

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.kitti_calibration import finite_numbers, format_calibration, parse_calibration, read_calibration
+from beambox.file_names import name_to_word, word_to_name
 from beambox.geometry import Calibration
-from beambox.io import name_to_word, read_text, word_to_name
+from beambox.io import read_text
 from beambox.structures import Detections, ImageAttributes, Labels
 
 __all__ = [

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.formats.binary import read_bin
-from beambox.io import read_json, read_names
+from beambox.file_names import read_names
+from beambox.io import read_json
 from beambox.structures import Frame, Labels
 
 __all__ = ["NuScenesSource", "nuscenes_tables"]

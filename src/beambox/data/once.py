@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean
 from beambox.data.names import NameList
 from beambox.data.read_points import read_frame
-from beambox.io import check_file_name, read_json, read_names, write_bytes, write_text
+from beambox.file_names import check_file_name, read_names
+from beambox.io import read_json, write_bytes, write_text
 from beambox.structures import Frame, Labels
 
 __all__ = ["ONCE_CLASSES", "OnceSource", "write_once_sequence", "write_once_split"]

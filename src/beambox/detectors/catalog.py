@@ -9,9 +9,9 @@ from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
-from torch import nn
 
 from beambox.checks import BeamboxError, did_you_mean
+from beambox.detectors.contract import AnyModel
 from beambox.detectors.dennet import DenNetConfig, dennet, names_since
 from beambox.detectors.hcnet import NAMES_SINCE as HCNET_NAMES
 from beambox.detectors.hcnet import HCNetConfig, hcnet
@@ -32,7 +32,7 @@ class CatalogEntry:
     """A detector: its configuration and how it is built from one."""
 
     config: type
-    build: Callable[[Any], nn.Module]
+    build: Callable[[Any], AnyModel]
     renames: Callable[[Any], Mapping[str, str]] = lambda _config: {}
     """For a configuration: how the names of tensors began in former versions -> how they begin now."""
 
@@ -47,7 +47,7 @@ CATALOG: dict[str, CatalogEntry] = {
 }
 
 
-def build(name: str, options: Mapping[str, Any] | None = None, most: int = MOST_ELEMENTS) -> Any:
+def build(name: str, options: Mapping[str, Any] | None = None, most: int = MOST_ELEMENTS) -> AnyModel:
     """Build a detector by name.
 
     Args:
@@ -87,7 +87,7 @@ def entry_of(name: str) -> CatalogEntry:
     return entry
 
 
-def name_of(model: nn.Module) -> str:
+def name_of(model: AnyModel) -> str:
     """Return the catalogue's name of a model, found by the type of its configuration."""
     for name, entry in CATALOG.items():
         if type(getattr(model, "config", None)) is entry.config:  # DenNet's extends Voxel R-CNN's
@@ -104,9 +104,9 @@ def options_since(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return current_fields(options, config_to_dict(entry_of(name).config()))
 
 
-def tensors_since(model: nn.Module, tensors: Mapping[str, T]) -> dict[str, T]:
+def tensors_since(model: AnyModel, tensors: Mapping[str, T]) -> dict[str, T]:
     """Return tensors of a weight file or a checkpoint under the names that the model gives them now."""
-    return current_names(tensors, CATALOG[name_of(model)].renames(getattr(model, "config")))  # noqa: B009
+    return current_names(tensors, CATALOG[name_of(model)].renames(model.config))
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:

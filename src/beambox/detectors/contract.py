@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,17 @@ from beambox.structures.batch import Batch
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 
-__all__ = ["DetectorConfig", "DetectorModel", "Foldable", "detections_from", "expect_made", "targets_from"]
+__all__ = [
+    "AnyModel",
+    "DetectorConfig",
+    "DetectorModel",
+    "Foldable",
+    "detections_from",
+    "expect_made",
+    "model_of",
+    "module_of",
+    "targets_from",
+]
 
 
 class DetectorConfig(Protocol):
@@ -28,6 +38,11 @@ class DetectorConfig(Protocol):
     @property
     def grid(self) -> VoxelGrid:
         """The region and the cells the network works on."""
+        ...
+
+    @property
+    def num_point_features(self) -> int:
+        """Values of a point that the network reads: x, y, z, intensity, ..."""
         ...
 
     @property
@@ -48,15 +63,23 @@ class Foldable(Protocol):
 P = TypeVar("P")
 
 
+@runtime_checkable
 class DetectorModel(Protocol[P]):
     """A network, its loss and its decoding.
 
     To detect: ``predictions = model(batch)``, ``detections = model.decode(predictions)``. To learn:
     ``predictions = model(batch, labels=labels)``, ``losses = model.loss(predictions, labels)``: a network with a second
     step looks, given labels, at the boxes it can learn from. The model keeps parameters, not results.
+
+    A detector is also a :class:`torch.nn.Module` (:func:`module_of`); what is asked of it as one stands here too.
     """
 
-    config: Any
+    training: bool
+
+    @property
+    def config(self) -> DetectorConfig:
+        """What it was built from."""
+        ...
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:
@@ -93,9 +116,40 @@ class DetectorModel(Protocol[P]):
         """As :class:`torch.nn.Module`'s."""
         ...
 
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """As :class:`torch.nn.Module`'s."""
+        ...
+
     def state_dict(self) -> Mapping[str, Tensor]:
         """As :class:`torch.nn.Module`'s."""
         ...
+
+
+AnyModel: TypeAlias = DetectorModel[Any]
+"""A detector whatever its predictions are: they go from its forward pass to its loss or its decoding unread."""
+
+
+def module_of(model: AnyModel) -> nn.Module:
+    """Return a detector as the module it is.
+
+    Raises:
+        BeamboxError: if it is none.
+    """
+    if not isinstance(model, nn.Module):
+        raise BeamboxError(f"a detector must be a torch.nn.Module, got {type(model).__name__}")
+    return model
+
+
+def model_of(module: nn.Module) -> AnyModel:
+    """Return a module as the detector it is.
+
+    Raises:
+        BeamboxError: naming what it lacks.
+    """
+    if isinstance(module, DetectorModel):
+        return module
+    lacking = [name for name in ("config", "dense", "loss", "decode") if not hasattr(module, name)]
+    raise BeamboxError(f"{type(module).__name__} is no detector: it has no {', '.join(lacking)}")
 
 
 def expect_made(with_labels: bool, wanted: bool) -> None:

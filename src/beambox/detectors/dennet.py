@@ -61,8 +61,9 @@ from beambox.layers.bev import (
     BN_MOMENTUM,
     conv_bn_relu,
     deconv_bn_relu,
+    enlarge_and_join,
     expect_levels_meet,
-    join_levels,
+    mean_over,
 )
 from beambox.layers.encoders import mean_voxels
 from beambox.layers.heads import PostProcess
@@ -335,7 +336,7 @@ class DensityBranch(nn.Module):
             raise BeamboxError(f"`max_count` must be at least 1 (a voxel counts itself), or none; got {max_count}")
         self.radii = tuple(radii)
         self.count_set = chosen("count_set", count_set, CountSet)
-        self.normalization = chosen("normalisation", normalization, Normalization)
+        self.normalization = chosen("normalization", normalization, Normalization)
         self.max_count = max_count
         self.own_points = own_points
         self.depth = depth
@@ -406,10 +407,10 @@ class AttentiveBackbone(nn.Module):
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, 256, Y, X)``: stages downwards, all enlarged and joined."""
         levels = []
-        for stage, up in zip(self.stages, self.ups):
+        for stage in self.stages:
             bev = stage(bev)  # (B, 64, Y, X), then (B, 128, Y / 2, X / 2)
-            levels.append(up(bev))  # (B, 128, Y, X)
-        return join_levels(levels)
+            levels.append(bev)
+        return enlarge_and_join(self.ups, levels)  # each (B, 128, Y, X)
 
 
 class AttentiveStage(nn.Module):
@@ -523,8 +524,8 @@ class CoordinateAttention(nn.Module):
         """Return ``bev`` weighed, of the same shape."""
         expect_shape("bev", bev, (None, self.channels, None, None))
         height, width = bev.shape[-2:]
-        rows = bev.mean(dim=3, keepdim=True)  # (B, C, H, 1)
-        columns = bev.mean(dim=2, keepdim=True).transpose(2, 3)  # (B, C, W, 1)
+        rows = mean_over(bev, 3)  # (B, C, H, 1)
+        columns = mean_over(bev, 2).transpose(2, 3)  # (B, C, W, 1)
         hidden = self.shared(torch.cat((rows, columns), dim=2))  # (B, m, H + W, 1)
         rows, columns = hidden.split((height, width), dim=2)
         by_row = torch.sigmoid(self.rows(rows))  # (B, C, H, 1)

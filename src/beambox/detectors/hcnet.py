@@ -47,7 +47,15 @@ from beambox.checks import BeamboxError, choose_fields, chosen, expect_shape
 from beambox.detectors.contract import detections_from, targets_from
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.anchors import AnchorClass, AnchorGrid
-from beambox.layers.bev import BN_EPS, BN_MOMENTUM, conv_bn_relu, deconv_bn_relu, join_levels
+from beambox.layers.bev import (
+    BN_EPS,
+    BN_MOMENTUM,
+    conv_bn_relu,
+    deconv_bn_relu,
+    enlarge_and_join,
+    join_levels,
+    mean_over,
+)
 from beambox.layers.heads import AnchorHead, AnchorPredictions, LossWeights, PostProcess, anchor_loss, select_boxes
 from beambox.layers.pillars import PillarFeatures
 from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_triton, choose, needs_gradient
@@ -421,7 +429,7 @@ class PyramidBackbone(nn.Module):
         top3 = self.block3(top2)  # (B, 256, Y / 8, X / 8)
         down2 = join_levels((top2, self.deblock3(top3)))  # (B, 256, Y / 4, X / 4)
         down1 = join_levels((top1, self.deblock2(down2)))  # (B, 128, Y / 2, X / 2)
-        return join_levels((self.up1(down1), self.up2(down2), self.up3(top3)))  # (B, 384, Y / 2, X / 2)
+        return enlarge_and_join((self.up1, self.up2, self.up3), (down1, down2, top3))  # (B, 384, Y / 2, X / 2)
 
 
 @dataclass(frozen=True)
@@ -526,8 +534,8 @@ class AdaptiveAdjustment(nn.Module):
 
     def forward(self, bev: Tensor) -> Tensor:
         """Return ``(B, C, Y, X)`` weighed, of the same shape."""
-        rows = self.rows(bev.mean(dim=3, keepdim=True))  # (B, C, Y, 1), equation 4
-        columns = self.columns(bev.mean(dim=2, keepdim=True))  # (B, C, 1, X), equation 5
+        rows = self.rows(mean_over(bev, 3))  # (B, C, Y, 1), equation 4
+        columns = self.columns(mean_over(bev, 2))  # (B, C, 1, X), equation 5
         weight = rows + columns  # (B, C, Y, X)
         return bev * (torch.sigmoid(weight) if self.gate is Gate.SIGMOID else weight)  # equation 6
 

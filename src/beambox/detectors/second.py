@@ -132,11 +132,14 @@ class SECOND(nn.Module):
 
         ``labels`` are for networks with a second step; they change nothing here.
         """
-        grid = self.config.grid if grid is None else grid
-        voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
-        stages = self.encoder(voxels)
+        return self.from_voxels(self.voxels(batch, self.config.grid if grid is None else grid))
+
+    def from_voxels(self, voxels: Voxels) -> AnchorPredictions:
+        """Predict from points that are already gathered into voxels."""
+        means = mean_voxels(voxels, self.config.absolute_xy)  # (V, columns)
+        stages = self.encoder(means)
         bev = self.backbone(stages.bev)  # (B, 512, ny / 8, nx / 8)
-        return self.head(bev, grid)
+        return self.head(bev, voxels.grid)
 
     @property
     def dense(self) -> tuple[nn.Module, ...]:

@@ -13,10 +13,11 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor, nn
+from torch import Tensor
 
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.detectors.catalog import build, config_to_dict, name_of, tensors_since
+from beambox.detectors.contract import AnyModel, module_of
 from beambox.io import parse_json, write_bytes
 
 __all__ = ["WeightFile", "load_weights", "read_weights", "save_weights"]
@@ -42,7 +43,7 @@ class WeightFile:
 
 def save_weights(
     path: str | Path,
-    model: nn.Module,
+    model: AnyModel,
     card: Mapping[str, Any] | None = None,
     *,
     tensors: Mapping[str, Tensor] | None = None,
@@ -67,7 +68,7 @@ def save_weights(
     header = {
         "format": FORMAT,
         "detector": name_of(model),
-        "config": json.dumps(config_to_dict(getattr(model, "config")), sort_keys=True),  # noqa: B009
+        "config": json.dumps(config_to_dict(model.config), sort_keys=True),
         "card": json.dumps(dict(card or {})),
     }
     write_bytes(Path(path), save(values, metadata=header), sync=True)
@@ -103,7 +104,7 @@ def read_weights(path: str | Path) -> WeightFile:
     return WeightFile(detector, config, card, tensors)
 
 
-def load_weights(path: str | Path, device: torch.device | str = "cpu") -> nn.Module:
+def load_weights(path: str | Path, device: torch.device | str = "cpu") -> AnyModel:
     """Build the model a weight file describes and fill it; the model is in evaluation mode.
 
     Raises:
@@ -115,7 +116,8 @@ def load_weights(path: str | Path, device: torch.device | str = "cpu") -> nn.Mod
     # what the file does not hold is refused before it takes memory; some buffers need not be in it
     model = build(stored.detector, stored.config, most=2 * tensor + 1_000_000)
     fill(model, stored.tensors, str(path))
-    return model.to(device).eval()
+    module_of(model).to(device).eval()
+    return model
 
 
 @functools.cache  # once per process
@@ -125,7 +127,7 @@ def warn_of_licence(name: str, licence: str) -> None:
         log.warning("the weights %s are not free for commercial use: %s", name, licence)
 
 
-def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
+def fill(model: AnyModel, tensors: Mapping[str, Tensor], where: str) -> None:
     """Copy tensors into a model, in the model's own element types; every name and shape must fit.
 
     Raises:

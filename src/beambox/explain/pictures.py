@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,6 +17,7 @@ from beambox.detectors.kassd.keypoints import map_coordinates, sample_bilinear
 from beambox.detectors.kassd.network import KASSD, KASSDPredictions, LocationAttention, location_weights
 from beambox.detectors.second import STRIDE
 from beambox.explain.drawing import Explained, draw_bars, draw_maps, draw_near, scatter_map
+from beambox.geometry.grid import VoxelGrid
 from beambox.infer.predictor import Detector
 from beambox.layers.heads import best_anchors
 from beambox.ops.neighborhood.reference import neighborhood_weights
@@ -41,15 +42,18 @@ def explain(detector: Detector, frame: Frame, score_threshold: float = 0.3) -> l
         BeamboxError: for another detector, or a sweep with no point where it looks.
     """
     expect_library("matplotlib", "plots", "drawing what a detector weighs")
-    drawers: dict[type, Callable[..., Iterator[Explained]]] = {HCNet: _hcnet, KASSD: _kassd, DenNet: _dennet}
-    drawer = next((draw for kind, draw in drawers.items() if isinstance(detector.model, kind)), None)
-    if drawer is None:
-        raise BeamboxError(f"{type(detector.model).__name__} has no attention to draw; HCNet, KASSD and DenNet have")
+    model = detector.model
+    if not isinstance(model, HCNet | KASSD | DenNet):
+        raise BeamboxError(f"{type(model).__name__} has no attention to draw; HCNet, KASSD and DenNet have")
     prepared = detector.prepare(frame)
     if not detector.sees(prepared):
         raise BeamboxError(f"{frame.id or 'the sweep'} has no point where the network looks; beambox doctor says why")
     batch = Batch.of([prepared]).to(detector.device)
-    return list(drawer(detector, batch, score_threshold))
+    if isinstance(model, HCNet):
+        return list(_hcnet(detector, model, batch, score_threshold))
+    if isinstance(model, KASSD):
+        return list(_kassd(detector, model, batch, score_threshold))
+    return list(_dennet(detector, model, batch, score_threshold))
 
 
 @contextmanager
@@ -63,7 +67,7 @@ def _seen(module: nn.Module) -> Iterator[list[tuple[tuple[Any, ...], Any]]]:
         handle.remove()
 
 
-def _found(detector: Detector, predictions: Any, score_threshold: float) -> Detections:
+def _found(detector: Detector, predictions: object, score_threshold: float) -> Detections:
     """Decode in the network's own frame."""
     found = detector.model.decode(predictions)[0].to("cpu")
     return found[found.scores >= score_threshold]
@@ -72,8 +76,8 @@ def _found(detector: Detector, predictions: Any, score_threshold: float) -> Dete
 # ---------------------------------------------------------------- HCNet
 
 
-def _hcnet(detector: Detector, batch: Batch, score_threshold: float) -> Iterator[Explained]:
-    model, grid = detector.model, detector.grid
+def _hcnet(detector: Detector, model: HCNet, batch: Batch, score_threshold: float) -> Iterator[Explained]:
+    grid = detector.grid
     boxes = _found(detector, detector.predict(batch), score_threshold).boxes
     voxels = model.voxels(batch, grid)
     stacks, pillars = pillar_stacks(model.voxel_net(voxels), voxels)  # (M, P, C), (M, 4)
@@ -105,8 +109,8 @@ def _hcnet(detector: Detector, batch: Batch, score_threshold: float) -> Iterator
 # ---------------------------------------------------------------- KASSD
 
 
-def _kassd(detector: Detector, batch: Batch, score_threshold: float) -> Iterator[Explained]:
-    model, grid = detector.model, detector.grid
+def _kassd(detector: Detector, model: KASSD, batch: Batch, score_threshold: float) -> Iterator[Explained]:
+    grid = detector.grid
     with _seen(model.neck.levels if isinstance(model.neck, LocationAttention) else model.neck) as notes:
         predictions: KASSDPredictions = detector.predict(batch)
     found = _found(detector, predictions, score_threshold)
@@ -132,7 +136,9 @@ def _kassd(detector: Detector, batch: Batch, score_threshold: float) -> Iterator
         yield Explained("keypoint_scores", title, draw_near(items, points, title, reach=4.0))
 
 
-def _keypoints(model: KASSD, predictions: KASSDPredictions, grid: Any, box: Tensor, kind: int) -> tuple[Tensor, Tensor]:
+def _keypoints(
+    model: KASSD, predictions: KASSDPredictions, grid: VoxelGrid, box: Tensor, kind: int
+) -> tuple[Tensor, Tensor]:
     """Return where a detection's keypoints lie, ``(K, 2)``, and their scores, ``(K,)``."""
     assert model.kam is not None and predictions.maps is not None
     head, options = predictions.head, model.config.kam_options
@@ -148,8 +154,8 @@ def _keypoints(model: KASSD, predictions: KASSDPredictions, grid: Any, box: Tens
 # ---------------------------------------------------------------- DenNet
 
 
-def _dennet(detector: Detector, batch: Batch, score_threshold: float) -> Iterator[Explained]:
-    model, grid = detector.model, detector.grid
+def _dennet(detector: Detector, model: DenNet, batch: Batch, score_threshold: float) -> Iterator[Explained]:
+    grid = detector.grid
     attention = [layer for layer in model.modules() if isinstance(layer, NeighborhoodAttention)]
     watched = [*attention, *([model.density] if model.density is not None else [])]
     if not watched:
@@ -189,7 +195,9 @@ def _dennet(detector: Detector, batch: Batch, score_threshold: float) -> Iterato
             yield Explained(f"neighborhood_{number}", title, draw_near(items, points, title, reach=reach))
 
 
-def _attended(layer: NeighborhoodAttention, pixels: Tensor, grid: Any, box: Tensor) -> tuple[Tensor, Tensor, float]:
+def _attended(
+    layer: NeighborhoodAttention, pixels: Tensor, grid: VoxelGrid, box: Tensor
+) -> tuple[Tensor, Tensor, float]:
     """Return places ``(L * L, 2)``, metres, that the cell at a box's middle attends to, weights, a cell's edge."""
     height, width, channels = pixels.shape[1:]
     edge = (grid.maximum[0] - grid.minimum[0]) / width

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from beambox.checks import BeamboxError, MissingFileError, how_to_install
-from beambox.detectors.contract import DetectorModel
+from beambox.checks import BeamboxError, MissingFileError, import_library
+from beambox.detectors.kassd import KamScore, KASSDPredictions
 from beambox.geometry.boxes import wrap_angle
 from beambox.geometry.grid import VoxelGrid
 from beambox.io import parse_json
@@ -26,6 +26,7 @@ __all__ = [
     "Differences",
     "compare",
     "gathered",
+    "outputs_of",
     "read_about",
     "runtime_is_there",
     "synthetic_sweep",
@@ -39,9 +40,13 @@ Both compute in float32 and add in another order, which shows in the sixth or se
 something else shows in the first three."""
 
 
+MOST_TURNED = 0.02
+"""Share of the boxes that rounding may turn."""
+
+
 @dataclass(frozen=True)
 class Differences:
-    """What onnxruntime and PyTorch differ by on a sweep, over all anchors."""
+    """What onnxruntime and PyTorch differ by on a sweep, over all rows of the outputs."""
 
     sweep: str
     """Name of the sweep."""
@@ -67,7 +72,32 @@ def runtime_is_there() -> bool:
     return find_spec("onnxruntime") is not None
 
 
-def verify(path: str | Path, model: DetectorModel[AnchorPredictions], points: Tensor) -> Differences:
+def outputs_of(config: Any, predictions: AnchorPredictions | KASSDPredictions) -> tuple[Tensor, Tensor]:
+    """Turn what a network says of one sweep into the outputs of its file.
+
+    Args:
+        config: of the network.
+        predictions: of one sweep.
+
+    Returns:
+        Boxes ``(A, 7)`` and scores ``(A, K)``, one row per anchor; of KASSD with KAM, one row per box that KAM scores,
+        0 for other classes than the box's, and 0 where a row is none.
+    """
+    if not isinstance(predictions, KASSDPredictions):
+        return predictions.decoded()[0], torch.sigmoid(predictions.cls[0])
+    found, head = predictions.candidates, predictions.head
+    if found is None or predictions.scores is None:
+        return outputs_of(config, head)
+    score = torch.sigmoid(predictions.scores.float())
+    if config.kam_options.score is KamScore.MULTIPLY:
+        score = score * found.cls
+    if found.valid is not None:
+        score = torch.where(found.valid, score, 0)
+    scores = score.new_zeros(score.shape[0], head.cls.shape[2]).scatter(1, found.classes[:, None], score[:, None])
+    return found.boxes, scores
+
+
+def verify(path: str | Path, model: Any, points: Tensor) -> Differences:
     """Compare a written file with the network it was made from.
 
     Args:
@@ -85,7 +115,7 @@ def verify(path: str | Path, model: DetectorModel[AnchorPredictions], points: Te
     return compare(path.read_bytes(), model, points, path.name)
 
 
-def compare(content: bytes, model: DetectorModel[AnchorPredictions], points: Tensor, sweep: str) -> Differences:
+def compare(content: bytes, model: Any, points: Tensor, sweep: str) -> Differences:
     """Run a file's content and the network on the same points; the file is fed by what its own metadata say."""
     session = opened(content)
     about = read_about(session)
@@ -100,15 +130,61 @@ def compare(content: bytes, model: DetectorModel[AnchorPredictions], points: Ten
     sample = torch.zeros(len(points), dtype=torch.int64)
     with torch.inference_mode():
         predictions = model(Batch(points, sample, 1), voxels.grid)
-        wanted, wanted_scores = predictions.decoded()[0], torch.sigmoid(predictions.cls[0])
-        if boxes.shape != wanted.shape or scores.shape != wanted_scores.shape:
+        wanted, wanted_scores = outputs_of(model.config, predictions)
+        chosen = isinstance(predictions, KASSDPredictions) and predictions.candidates is not None
+        if scores.shape[1:] != wanted_scores.shape[1:] or not (chosen or boxes.shape == wanted.shape):
             raise BeamboxError(
                 f"the file gives boxes {tuple(boxes.shape)} and scores {tuple(scores.shape)}, the network "
                 f"{tuple(wanted.shape)} and {tuple(wanted_scores.shape)}: it is of another network"
             )
-        apart, turned = box_differences(boxes, wanted, predictions.direction[0])
-        by_score = (scores - wanted_scores).abs().max()
-    return Differences(sweep, len(voxels.points), len(voxels), float(by_score), float(apart.max()), int(turned.sum()))
+        if chosen:
+            by_score, by_box, turned = chosen_differences(boxes, scores, wanted, wanted_scores)
+        else:
+            head = predictions.head if isinstance(predictions, KASSDPredictions) else predictions
+            apart, half_turns = box_differences(boxes, wanted, head.direction[0])
+            by_score, by_box = float((scores - wanted_scores).abs().max()), float(apart.max())
+            turned = int(half_turns.sum())
+    return Differences(sweep, len(voxels.points), len(voxels), by_score, by_box, turned)
+
+
+def chosen_differences(
+    boxes: Tensor, scores: Tensor, wanted: Tensor, wanted_scores: Tensor
+) -> tuple[float, float, int]:
+    """Compare the boxes that KAM scores, which both sides choose and order by scores that differ in the last digits.
+
+    Each box of the network is compared with the nearest of its class in the file, and the other way round, so that none
+    is missing on either side. KAM reads its maps around the box as it heads, so that a box that rounding turned has
+    another score: such boxes are counted and not compared.
+
+    Args:
+        boxes: ``(A, 7)`` of the file.
+        scores: ``(A, K)`` of the file; rows of zeros are none.
+        wanted: ``(M, 7)`` of the network.
+        wanted_scores: ``(M, K)`` of the network.
+
+    Returns:
+        The largest difference of a score, that of a box as :data:`TOLERANCE` measures it, and the boxes left out.
+    """
+    there, wanted_there = scores.amax(dim=1) > 0, wanted_scores.amax(dim=1) > 0
+    boxes, scores, wanted, wanted_scores = (
+        boxes[there],
+        scores[there],
+        wanted[wanted_there],
+        wanted_scores[wanted_there],
+    )
+    if not len(boxes) or not len(wanted):
+        return (0.0, 0.0, 0) if len(boxes) == len(wanted) else (1.0, math.inf, 0)
+    lengths = (boxes[None, :, :6] - wanted[:, None, :6]).abs() / wanted[:, None, :6].abs().clamp(min=1)
+    angle = wrap_angle(boxes[None, :, 6] - wanted[:, None, 6]).abs()  # (M, A)
+    apart = torch.maximum(lengths.amax(dim=2), torch.minimum(angle, math.pi - angle))
+    apart = torch.where(scores.argmax(dim=1) == wanted_scores.argmax(dim=1)[:, None], apart, math.inf)
+    nearest = apart.argmin(dim=1)  # (M,)
+    turned = angle.gather(1, nearest[:, None])[:, 0] > math.pi / 2
+    if int(turned.sum()) > max(1, MOST_TURNED * len(turned)):
+        return 1.0, math.inf, int(turned.sum())
+    by_score = (scores[nearest] - wanted_scores).abs().amax(dim=1)[~turned]
+    by_box = max(float(apart.amin(dim=1).max()), float(apart.amin(dim=0).max()))
+    return float(by_score.max()) if len(by_score) else 0.0, by_box, int(turned.sum())
 
 
 def box_differences(boxes: Tensor, wanted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,9 +213,7 @@ def box_differences(boxes: Tensor, wanted: Tensor, direction: Tensor) -> tuple[T
 
 def opened(content: bytes) -> Any:
     """Open a file's content in onnxruntime, on the CPU."""
-    if not runtime_is_there():
-        raise BeamboxError(f"comparing needs onnxruntime: {how_to_install('export')}")
-    import onnxruntime
+    onnxruntime = import_library("onnxruntime", "export", "comparing")
     from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidGraph, InvalidProtobuf, NotImplemented
 
     options = onnxruntime.SessionOptions()

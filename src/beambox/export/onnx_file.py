@@ -1,7 +1,8 @@
 """A detector as one ONNX file: points gathered into voxels in, boxes and scores of all anchors out.
 
-Gathering and post-processing stay outside; what they need stands in the file's metadata (``docs/export.md``). Detectors
-made of dense layers can be exported; sparse convolutions have no operator in ONNX.
+Gathering and post-processing stay outside; what they need stands in the file's metadata (``docs/export.md``). Sparse
+convolutions, which ONNX has no operator for, become gathers and matrix products (:mod:`beambox.ops.sparse_conv.graph`).
+Detectors with one stage can be exported.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -21,21 +22,27 @@ import torch
 from torch import Tensor, nn
 
 from beambox import __version__
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, lacking
 from beambox.detectors.catalog import config_to_dict, name_of
+from beambox.detectors.contract import AnyModel
 from beambox.detectors.hcnet import HCNet
+from beambox.detectors.kassd import KASSD
 from beambox.detectors.pointpillars import PointPillars
-from beambox.export.onnx_check import TOLERANCE, Differences, compare, runtime_is_there, synthetic_sweep
+from beambox.detectors.second import SECOND
+from beambox.export.onnx_check import TOLERANCE, Differences, compare, outputs_of, runtime_is_there, synthetic_sweep
 from beambox.geometry.grid import VoxelGrid
 from beambox.io import write_bytes
+from beambox.layers.anchors import AnchorGrid
+from beambox.layers.sparse import SparseBlock
 from beambox.ops.voxelize import Voxels
 
-__all__ = ["OPSETS", "DenseGraph", "Written", "export_onnx"]
+__all__ = ["OPSETS", "Exportable", "ExportedGraph", "Written", "export_onnx"]
+
+Exportable = PointPillars | HCNet | SECOND | KASSD
 
 OPSETS = range(18, 24)
 """Versions of ONNX's operators that can be asked for; before 18 there is no maximum over groups."""
 FORMAT = "beambox-onnx-1"
-INSTALL = how_to_install("export")
 
 
 @dataclass(frozen=True)
@@ -54,14 +61,31 @@ class Written:
     """What onnxruntime and PyTorch differ by, sweep by sweep; empty where onnxruntime is not installed."""
 
 
-class DenseGraph(nn.Module):
+class StoredAnchors(nn.Module):
+    """Anchors of one region as numbers, in place of an :class:`AnchorGrid`: the graph would make them anew."""
+
+    def __init__(self, anchors: AnchorGrid, grid: VoxelGrid) -> None:
+        super().__init__()
+        self.register_buffer("stored", anchors.boxes(grid))
+
+    def boxes(self, grid: VoxelGrid, device: torch.device | None = None) -> Tensor:
+        """Return the anchors ``(A, 7)``."""
+        stored = self.stored
+        assert isinstance(stored, Tensor)
+        return stored
+
+
+class ExportedGraph(nn.Module):
     """What the file computes: one sweep's points, already gathered into voxels, to decoded boxes and scores."""
 
-    def __init__(self, detector: PointPillars | HCNet, grid: VoxelGrid) -> None:
+    def __init__(self, detector: Exportable, grid: VoxelGrid) -> None:
         super().__init__()
-        self.detector = detector
+        self.detector = copy.deepcopy(detector)
+        self.detector.head.anchors = StoredAnchors(detector.anchors, grid)  # pyright: ignore[reportAttributeAccessIssue]
+        for block in self.detector.modules():
+            if isinstance(block, SparseBlock):
+                block.fold()
         self.grid = grid
-        self.register_buffer("anchors", detector.anchors.boxes(grid))
 
     def forward(self, points: Tensor, voxel: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         """Predict.
@@ -72,17 +96,17 @@ class DenseGraph(nn.Module):
             index: ``(V, 3)`` int64 cells (z, y, x), each once.
 
         Returns:
-            ``(A, 7)`` boxes in metres and radians and ``(A, K)`` scores, one row an anchor.
+            ``(A, 7)`` boxes in metres and radians and ``(A, K)`` scores, one row per anchor; of KASSD with KAM one
+            row per box that KAM scores.
         """
         count = torch.zeros_like(voxel[:1]).expand(index.shape[0]).scatter_add(0, voxel, torch.ones_like(voxel))
         of_sample = torch.cat((torch.zeros_like(index[:, :1]), index), dim=1)  # (V, 4) sample 0, z, y, x
         predictions = self.detector.from_voxels(Voxels(points, voxel, count, of_sample, 1, self.grid))
-        decoded = replace(predictions, anchors=self.anchors).decoded()  # stored ones, or the graph would make them anew
-        return decoded[0], torch.sigmoid(predictions.cls[0])
+        return outputs_of(self.detector.config, predictions)
 
 
 def export_onnx(
-    model: nn.Module,
+    model: AnyModel,
     path: str | Path,
     *,
     grid: VoxelGrid | None = None,
@@ -93,7 +117,7 @@ def export_onnx(
     """Write a detector as an ONNX file, after onnxruntime has computed from it what PyTorch computes.
 
     Args:
-        model: PointPillars or HCNet; it is copied, not changed.
+        model: PointPillars, HCNet, SECOND or KASSD; it is copied, not changed.
         path: file to write, ending in .onnx.
         grid: the region the file looks at, with cells of the model's size; the model's own where None.
         opset: version of ONNX's operators, one of :data:`OPSETS`.
@@ -110,14 +134,15 @@ def export_onnx(
         raise BeamboxError(f"the file to write must end in .onnx, got {path}")
     if opset not in OPSETS:
         raise BeamboxError(f"`opset` must lie in {OPSETS[0]} .. {OPSETS[-1]}, got {opset}")
-    missing = [name for name in ("onnx", "onnxscript") if find_spec(name) is None]
-    if missing:
-        raise BeamboxError(f"exporting needs {' and '.join(missing)}: {INSTALL}")
+    for name in ("onnx", "onnxscript"):
+        if find_spec(name) is None:
+            raise lacking(name, "export", "exporting")
     if sweeps and not runtime_is_there():
-        raise BeamboxError(f"comparing needs onnxruntime: {INSTALL}")
-    proto = traced(DenseGraph(detector, grid or detector.config.grid).eval(), opset)
-    about = json.dumps(described(detector, grid or detector.config.grid, card or {}), sort_keys=True)
-    proto.metadata_props.add(key="beambox", value=about)
+        raise lacking("onnxruntime", "export", "comparing")
+    proto = traced(ExportedGraph(detector, grid or detector.config.grid).eval(), opset)
+    about = described(detector, grid or detector.config.grid, card or {})
+    proto.metadata_props.add(key="beambox", value=json.dumps(about, sort_keys=True))
+    proto.metadata_props.add(key="beambox-plain", value=plain(about))
     content = proto.SerializeToString()
     checks = []
     if runtime_is_there():
@@ -131,17 +156,17 @@ def export_onnx(
     return Written(path, len(content), shapes(proto.graph.input), shapes(proto.graph.output), tuple(checks))
 
 
-def exportable(model: nn.Module) -> PointPillars | HCNet:
-    """Return a float32 copy on the CPU, in evaluation mode; refuse what ONNX has no operators for."""
-    if not isinstance(model, PointPillars | HCNet):
+def exportable(model: AnyModel) -> Exportable:
+    """Return a float32 copy on the CPU, in evaluation mode; refuse detectors with two stages."""
+    if not isinstance(model, Exportable):
         raise BeamboxError(
-            f"{name_of(model)} cannot be exported: ONNX has no operator for its sparse convolutions; "
-            "pointpillars and hcnet can be"
+            f"{name_of(model)} cannot be exported: its second stage starts from suppressed boxes, and ONNX has no "
+            "operator that suppresses rotated ones; pointpillars, hcnet, second and kassd can be"
         )
     return copy.deepcopy(model).cpu().float().eval()
 
 
-def traced(graph: DenseGraph, opset: int) -> Any:
+def traced(graph: ExportedGraph, opset: int) -> Any:
     """Trace a graph into an ``onnx.ModelProto`` with any number of points and voxels, weights inside."""
     count, cells = torch.export.Dim("N"), torch.export.Dim("V")
     example = (
@@ -185,7 +210,7 @@ def quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def described(detector: PointPillars | HCNet, grid: VoxelGrid, card: Mapping[str, Any]) -> dict[str, Any]:
+def described(detector: Exportable, grid: VoxelGrid, card: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the file's metadata say: everything that gathering and post-processing need."""
     config = detector.config
     return {
@@ -202,6 +227,23 @@ def described(detector: PointPillars | HCNet, grid: VoxelGrid, card: Mapping[str
         "config": config_to_dict(config),
         "card": dict(card),
     }
+
+
+def plain(about: Mapping[str, Any]) -> str:
+    """Write what running the file needs as lines of words, for programs without a JSON library; 0 is no limit."""
+    grid, post = about["grid"], about["post"]
+    values = {
+        "columns": [about["columns"]],
+        "minimum": grid["minimum"],
+        "cell": grid["cell"],
+        "cells": about["cells"],
+        "max_points": [about["max_points"] or 0],
+        "max_voxels": [about["max_voxels"] or 0],
+        **{key: [post[key]] for key in ("score_threshold", "nms_iou", "nms_pre", "nms_post")},
+    }
+    lines = [f"class {' '.join(name.split())}" for name in about["classes"]]
+    lines += [f"{key} {' '.join(map(str, row))}" for key, row in values.items()]
+    return "\n".join(lines) + "\n"
 
 
 def expect_agreement(found: Differences) -> None:

@@ -10,16 +10,17 @@ from __future__ import annotations
 import pickle
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from beambox.checks import BeamboxError, MissingFileError, did_you_mean, printable
+from beambox.detectors.contract import AnyModel, DetectorConfig, module_of
 from beambox.detectors.pointpillars import PointPillarsConfig, pointpillars
 from beambox.detectors.second import KITTI_CAR, SECONDConfig, second
 from beambox.detectors.second import ONCE as SECOND_ONCE
@@ -130,9 +131,9 @@ def voxel_rcnn_config(classes: int) -> VoxelRCNNConfig | None:
 
 @dataclass(frozen=True)
 class _Model:
-    config: Any
-    build: Any
-    names: Any
+    config: Callable[[int], DetectorConfig | None]
+    build: Callable[[Any], AnyModel]
+    names: Callable[[Any], Names]
 
 
 MODELS = {
@@ -146,7 +147,7 @@ MODELS = {
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def import_checkpoint(path: str | Path, model: str) -> nn.Module:
+def import_checkpoint(path: str | Path, model: str) -> AnyModel:
     """Build a detector and fill it from a checkpoint of OpenPCDet.
 
     Args:
@@ -172,7 +173,8 @@ def import_checkpoint(path: str | Path, model: str) -> nn.Module:
         )
     detector = kind.build(config)
     _fill(detector, state, dict(kind.names(config)), f"{path} does not fit {model} with {len(config.classes)} classes")
-    return detector.eval()
+    module_of(detector).eval()
+    return detector
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
@@ -231,7 +233,7 @@ def _count_classes(state: Mapping[str, Tensor], path: str | Path) -> int:
     return round((len(head) / 2) ** 0.5)
 
 
-def _fill(detector: nn.Module, state: Mapping[str, Tensor], layers: Mapping[str, str], refusal: str) -> None:
+def _fill(detector: AnyModel, state: Mapping[str, Tensor], layers: Mapping[str, str], refusal: str) -> None:
     """Copy every tensor; refuse before the first copy if any does not fit."""
     own = detector.state_dict()
     found: dict[str, Tensor] = {}
@@ -253,7 +255,7 @@ def _fill(detector: nn.Module, state: Mapping[str, Tensor], layers: Mapping[str,
     if wrong:
         more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
         raise BeamboxError(f"{refusal}: {'; '.join(wrong[:5])}{more}")
-    detector.load_state_dict(found)
+    module_of(detector).load_state_dict(found)
 
 
 def _laid_out(tensor: Tensor, shape: torch.Size) -> Tensor | None:

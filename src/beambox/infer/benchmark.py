@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ from torch import nn
 from beambox import __version__
 from beambox.checks import BeamboxError, MissingFileError
 from beambox.detectors.catalog import build
+from beambox.detectors.contract import module_of
+from beambox.infer.peaks import machine_peaks
 from beambox.infer.predictor import Detector
 from beambox.io import read_yaml
 from beambox.structures import Batch
@@ -41,6 +43,8 @@ class Report:
     """Versions, device, precision, threads, numbers of points and runs, load of the machine."""
     peak_memory: float | None
     """Most memory held, MB: of the GPU where it was used, else of the process; None where it cannot be told."""
+    peaks: dict[str, float] = field(default_factory=dict)
+    """What the machine reaches at best, as :func:`beambox.infer.peaks.machine_peaks` measures it."""
 
     def of(self, stages: Sequence[str]) -> list[float]:
         """Return the sum of some stages, one entry per run."""
@@ -53,7 +57,7 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain values; times in milliseconds a pass."""
-        stages = {stage: summary(self.milliseconds[stage]) for stage in STAGES}
+        stages = {stage: {**summary(self.milliseconds[stage]), "share": self.share(stage)} for stage in STAGES}
         return {
             **self.setting,
             "unit": "ms",
@@ -61,16 +65,29 @@ class Report:
             "total": summary(self.of(STAGES)),
             "sweeps_per_second": round(self.throughput, 3),
             "peak_memory_mb": None if self.peak_memory is None else round(self.peak_memory, 1),
+            "machine": self.peaks,
         }
+
+    def share(self, stage: str) -> float:
+        """Return a stage's part of the whole, 0 to 1, from the medians."""
+        medians = {name: statistics.median(times) for name, times in self.milliseconds.items()}
+        return round(medians[stage] / sum(medians.values()), 4)
 
     def table(self) -> str:
         """Write the numbers for a terminal."""
         names = ("mean", "median", "p90", "p99", "min")
         rows = [(stage, summary(self.milliseconds[stage])) for stage in STAGES] + [("total", summary(self.of(STAGES)))]
-        lines = ["ms            " + "".join(f"{name:>9}" for name in names)]
+        lines = ["ms            " + "".join(f"{name:>9}" for name in (*names, "share"))]
         lines += [f"{stage:<14}" + "".join(f"{row[name]:9.2f}" for name in names) for stage, row in rows]
+        for place, stage in enumerate(STAGES, 1):
+            lines[place] += f"{self.share(stage):9.0%}"
         memory = "" if self.peak_memory is None else f", peak memory {self.peak_memory:,.0f} MB"
         lines += [f"{self.throughput:.2f} sweeps/s{memory}"]
+        if self.peaks:
+            lines += [
+                "this machine at best: convolution {convolution_gflops:,.0f} GFLOP/s, matrix product "
+                "{product_gflops:,.0f} GFLOP/s, copy {copy_gbs:,.1f} GB/s".format(**self.peaks)
+            ]
         return "\n".join(lines)
 
     def kassd_table(self) -> str:
@@ -176,7 +193,8 @@ def measure(
         "runs": runs,
         "load_average": load,
     }
-    return Report(times, setting, peak_memory(detector.device))
+    memory = peak_memory(detector.device)  # before the machine's own peaks are measured
+    return Report(times, setting, memory, machine_peaks(detector.device, detector.dtype))
 
 
 @torch.inference_mode()
@@ -187,7 +205,7 @@ def one_pass(detector: Detector, paths: Sequence[Path]) -> tuple[dict[str, float
     prepared = Batch.of([detector.prepare(frame) for frame in frames]).to(detector.device)
     start = clock.now()
     first_layer: list[float] = []
-    with calling(detector.model, lambda: first_layer.append(clock.now()) if not first_layer else None):
+    with calling(module_of(detector.model), lambda: first_layer.append(clock.now()) if not first_layer else None):
         predictions = detector.predict(prepared)
     done = clock.now()
     detector.finish(predictions, frames)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import TypeVar
 
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
@@ -12,7 +13,10 @@ from beambox.detectors.contract import Foldable
 __all__ = ["fold_batch_norms"]
 
 
-def fold_batch_norms(model: nn.Module) -> nn.Module:
+M = TypeVar("M", bound=nn.Module)
+
+
+def fold_batch_norms(model: M) -> M:
     """Return a copy of a model for inference, with fewer passes over its maps.
 
     In every :class:`~torch.nn.Sequential`, a convolution (or linear layer) directly followed by a batch norm takes the

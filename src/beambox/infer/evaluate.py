@@ -11,7 +11,9 @@ import torch
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
-from beambox.io import check_file_name, write_text
+from beambox.detectors.contract import AnyModel, module_of
+from beambox.file_names import check_file_name
+from beambox.io import write_text
 from beambox.metrics import once
 from beambox.metrics.box_errors import box_errors
 from beambox.metrics.box_errors_result import BoxErrors
@@ -44,7 +46,7 @@ Detect = Callable[[Sequence[Frame]], list[Detections]]
 """Frames to their detections, best first, on the CPU; ``Detector.detect`` is one, :func:`network` makes one."""
 
 
-def network(model: Any, dtype: torch.dtype = torch.float32) -> Detect:
+def network(model: AnyModel, dtype: torch.dtype = torch.float32) -> Detect:
     """Detect with a bare network as it stands, in training say: its mode is restored after each call.
 
     Args:
@@ -56,14 +58,14 @@ def network(model: Any, dtype: torch.dtype = torch.float32) -> Detect:
     @torch.inference_mode()
     def detect(frames: Sequence[Frame]) -> list[Detections]:
         device = next(iter(model.parameters())).device
-        was_training = model.training
-        model.eval()
+        module, was_training = module_of(model), model.training
+        module.eval()
         try:
             with torch.autocast(device.type, dtype=dtype if lower else torch.bfloat16, enabled=lower):
                 predictions = model(Batch.of(frames).to(device))
             found = model.decode(predictions)
         finally:
-            model.train(was_training)
+            module.train(was_training)
         return [replace(one.to("cpu"), frame_id=frame.id) for frame, one in zip(frames, found)]
 
     return detect

@@ -14,7 +14,7 @@ from beambox.infer.inputs import Sweep
 from beambox.infer.journal import Journal, done_in, need_pyarrow, write_parquet
 from beambox.infer.results import FORMATS, choose_formats
 
-__all__ = ["TABLES", "Job", "choose_kinds", "parse_shard", "remaining", "run_job"]
+__all__ = ["TABLES", "Job", "Tally", "choose_kinds", "expect_unfinished", "parse_shard", "remaining", "run_job"]
 
 MOST_FAULTS = 5
 TABLES = ("jsonl", "parquet")
@@ -106,10 +106,7 @@ def run_job(sweeps: Sequence[Sweep], job: Job, workers: int = 1, *, skip_existin
     """
     if "parquet" in job.kinds:
         need_pyarrow()
-    for path in sorted(job.out.glob(f"{_part(job)}*.jsonl")):
-        with Journal(path) as journal:  # waits for what a killed run left behind to end
-            if journal.done and not skip_existing:
-                raise BeamboxError(f"{path} holds sweeps already: go on with --skip-existing, or give another folder")
+    expect_unfinished(job, skip_existing)
     sweeps = remaining(sweeps, job, skip_existing)
     if workers <= 1:
         tally = _work(sweeps, job, 0, 1)
@@ -119,6 +116,17 @@ def run_job(sweeps: Sequence[Sweep], job: Job, workers: int = 1, *, skip_existin
         journals = sorted(job.out.glob(f"{_part(job)}*.jsonl"))
         write_parquet(journals, job.out / f"{_part(job)}.parquet")
     return tally
+
+
+def expect_unfinished(job: Job, skip_existing: bool = False) -> None:
+    """Refuse a shard whose journals hold sweeps already, unless these are to be skipped.
+
+    Waits for what a killed run left behind to end.
+    """
+    for path in sorted(job.out.glob(f"{_part(job)}*.jsonl")):
+        with Journal(path) as journal:
+            if journal.done and not skip_existing:
+                raise BeamboxError(f"{path} holds sweeps already: go on with --skip-existing, or give another folder")
 
 
 def _part(job: Job) -> str:

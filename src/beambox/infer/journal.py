@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, import_library
 from beambox.io import parse_json, replacing
 from beambox.structures import Detections
 
@@ -133,14 +133,11 @@ def need_pyarrow() -> None:
 
 
 def _pyarrow() -> tuple[Any, Any]:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise BeamboxError(
-            f"Parquet files need the library pyarrow: {how_to_install('parquet')}, or write --format jsonl"
-        ) from None
-    return pyarrow, pyarrow.parquet
+    arrow, parquet = (
+        import_library(name, "parquet", "writing Parquet files", "or write --format jsonl")
+        for name in ("pyarrow", "pyarrow.parquet")
+    )
+    return arrow, parquet
 
 
 def _rounded(row: dict[str, float | str]) -> dict[str, float | str]:

@@ -19,8 +19,9 @@ import torch
 from beambox import __version__
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
+from beambox.file_names import check_file_name
 from beambox.infer.evaluate import Detect
-from beambox.io import check_file_name, parse_json
+from beambox.io import parse_json
 from beambox.structures import Detections, Frame
 
 __all__ = ["KeptDetections", "digest"]

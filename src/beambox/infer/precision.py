@@ -18,8 +18,12 @@ PRECISIONS: dict[str, torch.dtype] = {
 }
 
 
-def bfloat16_reason(device: torch.device) -> str | None:
-    """Say why bfloat16 would not be faster on a device, or return None where it is native."""
+def bfloat16_reason(device: torch.device, *, training: bool = False) -> str | None:
+    """Say why bfloat16 would not be faster on a device, or return None where it would.
+
+    On a CPU with AVX512-BF16 but without AMX, training gains from it; detection does not, which in float32 leaves out
+    empty ground and half of the multiplications of 3 x 3 convolutions (``benchmarks/peers.py`` measures both).
+    """
     if device.type == "cuda":
         major, minor = torch.cuda.get_device_capability(device)
         if major < 8:
@@ -27,14 +31,14 @@ def bfloat16_reason(device: torch.device) -> str | None:
         return None
     if device.type == "cpu":
         # torch has no public question for these two; without them bfloat16 is emulated and slower than float32
-        if torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported():
+        if torch.cpu._is_amx_tile_supported() or (training and torch.cpu._is_avx512_bf16_supported()):
             return None
-        return "this CPU has neither AMX nor AVX512-BF16"
+        return "this CPU has neither AMX nor AVX512-BF16" if training else "this CPU has no AMX"
     return f"not measured on {device.type}"
 
 
 def choose_precision(precision: str, device: torch.device) -> torch.dtype:
-    """Turn a user's word into an element type; "auto" is bfloat16 where it is native, else float32.
+    """Turn a user's word into an element type; "auto" is bfloat16 where it is faster, else float32.
 
     Raises:
         BeamboxError: for an unknown word.

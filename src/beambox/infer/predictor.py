@@ -16,12 +16,15 @@ from torch import Tensor, nn
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.formats.kept import close_kept
 from beambox.data.read_points import points_from_array
+from beambox.detectors.contract import AnyModel, DetectorConfig, model_of, module_of
 from beambox.detectors.weights import load_weights, read_weights
 from beambox.geometry import VoxelGrid
 from beambox.geometry.axes import Axes
 from beambox.infer.bn_folding import fold_batch_norms
 from beambox.infer.forking import survive_fork
+from beambox.infer.ground import EmptyGround
 from beambox.infer.inputs import Sweep, read_sweep
+from beambox.infer.memory import keep_memory
 from beambox.infer.precision import choose_device, choose_precision
 from beambox.infer.sensor_alignment import SensorAlignment
 from beambox.infer.sensor_profile import SensorProfile
@@ -45,7 +48,7 @@ class Detector:
 
     def __init__(
         self,
-        model: Any,
+        model: AnyModel,
         *,
         card: Mapping[str, Any] | None = None,
         device: str | torch.device | None = None,
@@ -77,7 +80,7 @@ class Detector:
         self.device = choose_device(device)
         self.dtype = choose_precision(precision, self.device)
         self.card = dict(card or {})
-        self.config: Any = model.config
+        self.config: DetectorConfig = model.config
         self.grid: VoxelGrid = grid or self.config.grid
         self.view: View = view
         self.alignment = alignment or SensorAlignment()
@@ -85,8 +88,11 @@ class Detector:
         self.fields = fields
         self.batch_size = batch_size
         survive_fork()
-        folded = fold_batch_norms(model).to(self.device)
-        self.model: Any = channels_last(folded)
+        folded = fold_batch_norms(module_of(model)).to(self.device)
+        self.model: AnyModel = model_of(channels_last(folded))
+        self.ground = EmptyGround()
+        if self.device.type == "cpu":
+            keep_memory()
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -94,7 +100,9 @@ class Detector:
         return self.config.classes
 
     @overload
-    def __call__(self, given: np.ndarray | Tensor | Frame) -> Detections: ...
+    def __call__(  # pyright: ignore[reportOverlappingOverload]  # an array can be iterated over, but is one sweep
+        self, given: np.ndarray | Tensor | Frame
+    ) -> Detections: ...
     @overload
     def __call__(self, given: str | Path) -> Detections | Any: ...  # a list for a folder, a pattern or a recording
     @overload
@@ -144,7 +152,7 @@ class Detector:
         elif isinstance(given, np.ndarray | Tensor):
             points, notes = points_from_array(given, scale)
             frame = Frame(points, notes=notes)
-        elif isinstance(given, Frame):
+        elif isinstance(given, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]  # callers may not be typed
             if scale is None:
                 return given
             brighter = given.points.clone()
@@ -203,6 +211,7 @@ class Detector:
         survive_fork()
         lower = self.dtype != torch.float32
         with torch.autocast(self.device.type, dtype=self.dtype if lower else torch.bfloat16, enabled=lower):
+            self.ground.learn(module_of(self.model), self.grid)
             return self.model(batch, self.grid)
 
     @torch.inference_mode()
@@ -241,7 +250,8 @@ def region(model_grid: VoxelGrid, wanted: float | Sequence[float] | VoxelGrid) -
     numbers = [-wanted, -wanted, wanted, wanted] if isinstance(wanted, int | float) else list(wanted)
     if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
         raise BeamboxError(f"a range is one number, or x_min, y_min, x_max, y_max in metres, got {wanted}")
-    low, high = [], []
+    low: list[float] = []
+    high: list[float] = []
     for axis in (0, 1):
         step, start = model_grid.cell[axis] * STRIDE, model_grid.minimum[axis]
         first = math.floor((numbers[axis] - start) / step + 1e-6)
@@ -296,7 +306,7 @@ def load(
     survive_fork()
     path = find_weights(name)
     chosen = choose_device(device)
-    model: Any = load_weights(path, "cpu")
+    model = load_weights(path, "cpu")
     card = read_weights(path).card
     trained = SensorProfile.of(card, model.config.grid).sensor_height
     alignment = SensorAlignment(

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from beambox.checks import BeamboxError
 from beambox.detectors.kassd import KASSDPredictions
 from beambox.detectors.voxel_rcnn import VoxelRCNNPredictions
 from beambox.infer.predictor import Detector
@@ -33,18 +34,21 @@ def detect_with_scores(detector: Detector, frame: Frame) -> tuple[Detections, ND
     return detector.finish(predictions, [frame])[0], scores.T.flip(0, 1).numpy()
 
 
-def score_map(detector: Detector, predictions: Any) -> Tensor:
+def score_map(detector: Detector, predictions: object) -> Tensor:
     """Return the largest class score of each place's anchors, ``(B, Y, X)`` in [0, 1]; rows are y, columns x.
 
     Args:
         detector: who predicted.
         predictions: of its network; of two stages, those of the first are shown.
     """
-    head = predictions
+    head: Any = predictions
     if isinstance(predictions, KASSDPredictions):
         head = predictions.head
     elif isinstance(predictions, VoxelRCNNPredictions):
         head = predictions.first
-    rows, columns = detector.model.anchors.map_size(detector.grid)
+    anchors: Any = getattr(detector.model, "anchors", None)
+    if anchors is None or not hasattr(head, "cls"):
+        raise BeamboxError(f"{type(detector.model).__name__} has no anchors, so it has no map of scores")
+    rows, columns = anchors.map_size(detector.grid)
     best = torch.sigmoid(head.cls.float()).amax(dim=2)  # (B, N), anchors in the order (y, x, class, rotation)
     return best.view(len(best), rows, columns, -1).amax(dim=3).cpu()

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, cast
 
 import torch
 
+from beambox.detectors.contract import module_of
 from beambox.detectors.weights import load_weights
-from beambox.geometry import VoxelGrid
 from beambox.infer.predictor import find_weights, load
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.simulate import SimulatedSource
@@ -64,15 +63,16 @@ def warm_up(
 def _train(name: str, frame: Frame, device: str) -> None:
     """Compute losses and gradients once, on a small part of the range."""
     chosen = load(name, device=device).device
-    model = load_weights(find_weights(name), chosen).train()
-    grid: VoxelGrid = cast(Any, model).config.grid
+    model = load_weights(find_weights(name), chosen)
+    module_of(model).train()
+    grid = model.config.grid
     nx, ny, _ = grid.size
     side = min(WINDOW, nx, ny)
     window = grid.window((0, (ny - side) // 2 // COARSE * COARSE), (side, side))  # straight ahead
     assert frame.labels is not None, "simulated frames are labelled"
     batch = Batch.of([frame.camera_view(), frame.camera_view()]).to(chosen)
     labels = [frame.labels, frame.labels]
-    losses = cast(Any, model).loss(model(batch, window, labels=labels), labels)
+    losses = model.loss(model(batch, window, labels=labels), labels)
     torch.stack(list(losses.values())).sum().backward()
 
 

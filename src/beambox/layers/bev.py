@@ -3,25 +3,68 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from beambox.checks import BeamboxError, expect_same_length
+from beambox.ops.map_conv import GroundedConv, MapKernel
 
-__all__ = ["BevBackbone", "ConvBnReLU", "conv_bn_relu", "deconv_bn_relu", "expect_levels_meet", "join_levels"]
+__all__ = [
+    "BevBackbone",
+    "ConvBnReLU",
+    "conv_bn_relu",
+    "deconv_bn_relu",
+    "enlarge_and_join",
+    "expect_levels_meet",
+    "join_levels",
+]
 
 BN_EPS = 1e-3
 BN_MOMENTUM = 0.01
 
 
 class ConvBnReLU(nn.Sequential):
-    """A convolution of maps, batch norm, ReLU."""
+    """A convolution of maps, batch norm, ReLU; once folded, one operation."""
 
-    def forward(self, bev: Tensor) -> Tensor:
-        """Map ``(B, C, Y, X)`` to ``(B, channels, Y', X')``."""
+    _folded: GroundedConv | None = None
+
+    @property
+    def folded(self) -> GroundedConv | None:
+        """The one operation, of the layer's present weights; None before it is folded."""
+        kernel = None if self._folded is None else self._folded.kernel
+        if kernel is not None and (kernel.weight is not self[0].weight or kernel.bias is not self[0].bias):
+            self._folded = self.operation()  # somebody put other parameters in their place
+        return self._folded
+
+    def forward(self, bev: Tensor, out: Tensor | None = None) -> Tensor:
+        """Map ``(B, C, Y, X)`` to ``(B, channels, Y', X')``; a folded block writes to ``out`` where it is given."""
+        folded = self.folded
+        if folded is not None:
+            return folded(bev, out)
         return super().forward(bev)  # torch.compile passes over the forward of torch's own class and enters this one
+
+    def fold(self) -> None:
+        """Take the batch norm into the convolution for good; training ends here."""
+        conv, norm, _ = self
+        if not isinstance(conv, nn.Conv2d | nn.ConvTranspose2d) or not isinstance(norm, nn.BatchNorm2d):
+            return  # it is folded already
+        conv = fuse_conv_bn_eval(conv, norm, transpose=isinstance(conv, nn.ConvTranspose2d))
+        self[0], self[1] = conv, nn.Identity()
+        self._folded = self.operation()
+
+    def operation(self) -> GroundedConv:
+        """Make one operation of the folded convolution and ReLU."""
+        conv = self[0]
+        assert isinstance(conv, nn.Conv2d | nn.ConvTranspose2d)
+        padding, output_padding = conv.padding, conv.output_padding
+        assert isinstance(padding, tuple) and isinstance(output_padding, tuple)
+        transposed = isinstance(conv, nn.ConvTranspose2d)
+        options = (conv.stride[0], padding[0], conv.dilation[0], transposed, output_padding[0])
+        return GroundedConv(MapKernel(conv.weight, conv.bias, *options, relu=True))
 
 
 def conv_bn_relu(in_channels: int, channels: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> ConvBnReLU:
@@ -86,10 +129,10 @@ class BevBackbone(nn.Module):
     def forward(self, bev: Tensor) -> Tensor:
         """Map ``(B, in_channels, Y, X)`` to ``(B, out_channels, Y / s, X / s)``, s the first stage's net stride."""
         levels = []
-        for stage, up in zip(self.stages, self.ups):
+        for stage in self.stages:
             bev = stage(bev)
-            levels.append(up(bev))
-        return join_levels(levels)
+            levels.append(bev)
+        return enlarge_and_join(self.ups, levels)
 
 
 def expect_levels_meet(strides: Sequence[int], up_strides: Sequence[int]) -> None:
@@ -104,6 +147,32 @@ def expect_levels_meet(strides: Sequence[int], up_strides: Sequence[int]) -> Non
             f"`up_strides` must bring every stage back to the size of the first: with strides {list(strides)} they "
             f"are {needed}, got {list(up_strides)}"
         )
+
+
+def enlarge_and_join(ups: Iterable[nn.Module], levels: Sequence[Tensor]) -> Tensor:
+    """Enlarge each level and join them along the channels, cut to the first one's size.
+
+    Folded blocks write to their place in the joined map, which saves a copy of it.
+    """
+    folded = [up.folded for up in ups if isinstance(up, ConvBnReLU) and up.folded is not None]
+    if len(folded) < len(levels) or not all(up.is_fused(level) for up, level in zip(folded, levels)):
+        return join_levels([up(level) for up, level in zip(ups, levels)])
+    height, width = folded[0].kernel.size(levels[0].shape[2:])
+    edges = list(accumulate((up.kernel.out_channels for up in folded), initial=0))
+    joined = levels[0].new_empty((len(levels[0]), height, width, edges[-1])).permute(0, 3, 1, 2)
+    for up, level, (low, high) in zip(folded, levels, pairwise(edges)):
+        up(level, joined[:, low:high])
+    return joined
+
+
+def mean_over(bev: Tensor, dim: int) -> Tensor:
+    """Average ``(B, C, Y, X)`` over rows (``dim`` 2) or columns (3) and keep the dimension.
+
+    PyTorch's own mean takes seven times as long on maps that are laid out channels last.
+    """
+    if not bev.is_contiguous(memory_format=torch.channels_last) or torch.compiler.is_exporting():
+        return bev.mean(dim=dim, keepdim=True)
+    return bev.permute(0, 2, 3, 1).mean(dim=dim - 1, keepdim=True).permute(0, 3, 1, 2)
 
 
 def join_levels(levels: Sequence[Tensor]) -> Tensor:

@@ -27,7 +27,7 @@ def mean_voxels(voxels: Voxels, absolute_xy: bool = True) -> SparseTensor:
         absolute_xy: whether x and y are metres from the sensor; else they are cells from the voxel's centre, so that a
             network sees the same wherever it looks.
     """
-    means = segment_mean(voxels.points, voxels.voxel, len(voxels.index))  # (V, C)
+    means = segment_mean(voxels.points, voxels.voxel, voxels.index.shape[0])  # (V, C)
     if not absolute_xy:
         cell = constant(voxels.grid.cell[:2], means.device)
         offset = (means[:, :2] - voxels.grid.center(voxels.index[:, 1:])[:, :2]) / cell

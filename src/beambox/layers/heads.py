@@ -15,7 +15,8 @@ from beambox.layers.anchors import AnchorGrid
 from beambox.layers.assigners import assign
 from beambox.layers.coders import decode_boxes, direction_bin, encode_boxes, resolve_heading
 from beambox.layers.losses import sigmoid_focal, sine_difference, smooth_l1
-from beambox.ops.dispatch import waiting_is_dear
+from beambox.ops.dispatch import exporting, waiting_is_dear
+from beambox.ops.map_conv import GroundedConv, MapKernel
 from beambox.ops.nms import nms, nms_of_samples
 
 __all__ = [
@@ -93,7 +94,7 @@ class PostProcess:
 
 
 class AnchorHead(nn.Module):
-    """Three 1 x 1 convolutions on a bird's-eye-view map."""
+    """Three 1 x 1 convolutions on a bird's-eye-view map; once folded, one."""
 
     def __init__(self, in_channels: int, anchors: AnchorGrid) -> None:
         super().__init__()
@@ -106,6 +107,31 @@ class AnchorHead(nn.Module):
         prior = 0.01  # share of positives that a fresh network predicts, so that the focal loss starts calm
         nn.init.constant_(self.cls.bias, -math.log((1 - prior) / prior))  # pyright: ignore[reportArgumentType]
         nn.init.normal_(self.box.weight, std=0.001)
+        self.is_folded = False
+        self._one: tuple[tuple[int, ...], GroundedConv] | None = None
+
+    def fold(self) -> None:
+        """Make one operation of the three convolutions wherever that is faster; training ends here."""
+        self.is_folded = True
+
+    def joined(self) -> tuple[Tensor, Tensor]:
+        """Return weight ``(A * (K + 7 + 2), C)`` and bias of the three convolutions as one."""
+        layers = (self.cls, self.box, self.direction)
+        biases = [layer.bias for layer in layers if layer.bias is not None]
+        return torch.cat([layer.weight.flatten(1) for layer in layers]), torch.cat(biases)
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def one(self) -> GroundedConv | None:
+        """Return the three as one convolution, made anew once a weight has changed; None where changes do not show."""
+        weights = list(self.parameters())
+        if any(weight.is_inference() for weight in weights):
+            return None
+        state = tuple(n for weight in weights for n in (weight.data_ptr(), weight._version))
+        if self._one is None or self._one[0] != state:
+            weight, bias = self.joined()
+            self._one = (state, GroundedConv(MapKernel(weight[:, :, None, None], bias)))
+        return self._one[1]
 
     def forward(self, bev: Tensor, grid: VoxelGrid) -> AnchorPredictions:
         """Predict over a map.
@@ -115,10 +141,11 @@ class AnchorHead(nn.Module):
             grid: the region the map covers.
         """
         layers = (self.cls, self.box, self.direction)
-        # One matrix product for the three: a 1 x 1 convolution is one, and on the CPU this is several times faster.
-        weight = torch.cat([layer.weight.flatten(1) for layer in layers])  # (A * (K + 7 + 2), C)
-        bias = torch.cat([layer.bias for layer in layers if layer.bias is not None])
-        cells = functional.linear(bev.permute(0, 2, 3, 1), weight, bias)  # (B, Y, X, A * (K + 7 + 2))
+        one = self.one() if self.is_folded else None
+        if one is not None and one.is_fused(bev):
+            cells = one(bev).permute(0, 2, 3, 1)  # (B, Y, X, A * (K + 7 + 2))
+        else:  # a 1 x 1 convolution is a matrix product, and one is faster than three
+            cells = functional.linear(bev.permute(0, 2, 3, 1), *self.joined())  # (B, Y, X, A * (K + 7 + 2))
         cls, box, direction = cells.split([layer.out_channels for layer in layers], dim=-1)
         size = len(bev)
         return AnchorPredictions(
@@ -229,6 +256,9 @@ def best_of_samples(score: Tensor, threshold: float, limit: int) -> tuple[Tensor
         The P best scores ``(B, P)`` and their rows ``(B, P)`` int64, and how many of them count ``(B,)`` int64.
     """
     known = torch.where(score >= threshold, score, -torch.inf)
+    if exporting():  # the operator of ONNX; which of equals comes first is its own affair
+        known, rows = known.topk(min(limit, known.shape[1]), dim=1)
+        return known, rows, (known > -torch.inf).sum(dim=1)
     known, rows = known.sort(dim=1, descending=True, stable=True)
     known, rows = known[:, :limit], rows[:, :limit]
     return known, rows, (known > -torch.inf).sum(dim=1)

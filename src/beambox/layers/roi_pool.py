@@ -16,7 +16,7 @@ from beambox.geometry.constants import constant
 from beambox.geometry.grid import VoxelGrid
 from beambox.layers.roi import Rois
 from beambox.ops.sparse_conv import SparseTensor
-from beambox.ops.voxel_query import voxel_query
+from beambox.ops.voxel_query import pooled, pooled_query, voxel_query
 
 __all__ = ["PoolLevel", "RoiHead", "RoiPredictions", "VoxelRoiPool"]
 
@@ -70,19 +70,28 @@ class _Gather(nn.Module):
         minimum = constant(grid.minimum, points.device)
         centers = (sites.indices[:, 1:].flip(1) + 0.5) * size + minimum  # (V, 3)
         own = torch.cat((cells[:, :1], torch.div(cells[:, 1:], level.stride, rounding_mode="floor")), dim=1)
-        found = voxel_query(points, own, sites, centers, level.query_range, level.radius, level.max_samples)  # (M, S)
-        none = found[:, :1] < 0
         kind = self.feature.weight.dtype
         features = _normed(self.feature(cell_features.features.to(kind)), self.feature_norm)  # (V, C)
-        row = found.clamp(min=0)
-        if len(features) == 0:
-            # the sum of no rows is zero and keeps every parameter in the graph, as processes in step need
-            features, centers = features.sum(dim=0, keepdim=True), centers.new_zeros((1, 3))
-        gathered = torch.where(none[..., None], 0.0, features[row])  # (M, S, C)
-        away = torch.where(none[..., None], 0.0, centers[row] - points[:, None])  # (M, S, 3)
-        position = _normed(self.offset(away.to(kind)).flatten(0, 1), self.offset_norm).unflatten(0, found.shape)
-        pooled = functional.relu((gathered + position).amax(dim=1))  # (M, C); ReLU and maximum commute
-        return functional.relu(_normed(self.out(pooled), self.out_norm))
+        where = (points, own, sites, centers, level.query_range, level.radius, level.max_samples)
+        if self.is_fused(features):
+            described = pooled_query(*where, features, self.offset.weight, self.offset.bias)  # (M, C)
+        else:
+            described = pooled(points, centers, voxel_query(*where), features, self.position)  # (M, C)
+        return functional.relu(_normed(self.out(described), self.out_norm))
+
+    def position(self, away: Tensor) -> Tensor:
+        """Describe ways from point to voxel: ``(N, 3)`` to ``(N, channels)``."""
+        return _normed(self.offset(away), self.offset_norm)
+
+    def is_fused(self, features: Tensor) -> bool:
+        """Tell whether search and pooling are one: folded, on a CPU, in float32."""
+        return (
+            self.offset.bias is not None
+            and isinstance(self.offset_norm, nn.Identity)
+            and features.device.type == "cpu"
+            and features.dtype == torch.float32
+            and not torch.is_autocast_enabled("cpu")
+        )
 
 
 def _normed(values: Tensor, norm: nn.Module) -> Tensor:

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError, MissingFileError
+from beambox.file_names import read_names
 from beambox.geometry.calibration import Calibration, CameraBoxes
-from beambox.io import read_names, read_text
+from beambox.io import read_text
 from beambox.structures.detections import Detections
 from beambox.structures.labels import Labels
 

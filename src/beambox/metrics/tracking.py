@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, import_library
 
 __all__ = ["ClearScores", "HotaScores", "TrackingFrame", "amota", "assign", "clear_mot", "hota"]
 
@@ -233,8 +233,4 @@ def assign(gain: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Pair rows and columns so that the sum of gains is largest."""
     if not gain.size:
         return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    try:
-        from scipy.optimize import linear_sum_assignment
-    except ImportError:
-        raise BeamboxError(f"scoring tracks needs the library scipy: {how_to_install('track')}") from None
-    return linear_sum_assignment(-gain)
+    return import_library("scipy.optimize", "track", "scoring tracks").linear_sum_assignment(-gain)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from threading import Lock
 from typing import Any
 
 import numba
@@ -62,23 +63,39 @@ def _compile(function: Callable[..., Any], fastmath: bool | set[str]) -> Callabl
         return numba.njit(nogil=True, error_model="numpy", fastmath=fastmath)(function)
 
 
-def parallel_for(kernel: Callable[[int, int], None], length: int, smallest: int = 1) -> None:
-    """Run ``kernel(start, stop)`` over ``0 .. length`` in one block a thread.
+PIECES = 4
+"""Blocks a thread: one that another program holds up then leaves its share to the others."""
 
-    Blocks must be independent, so that the result does not depend on their number.
+
+def parallel_for(kernel: Callable[[int, int], None], length: int, smallest: int = 1) -> None:
+    """Run ``kernel(start, stop)`` over ``0 .. length`` in blocks, each taken by the next free thread.
+
+    Blocks must be independent, so that the result does not depend on their number or order.
 
     Args:
         kernel: releases the interpreter's lock, or nothing is won.
         length: number of items.
         smallest: no block is shorter, as starting a thread takes about 0.1 ms.
     """
-    blocks = max(1, min(torch.get_num_threads(), length // max(1, smallest)))
-    edges = [length * i // blocks for i in range(blocks + 1)]
-    if blocks == 1:
+    most = max(1, length // max(1, smallest))
+    threads = min(torch.get_num_threads(), most)
+    if threads <= 1:
         kernel(0, length)
         return
-    with ThreadPoolExecutor(blocks - 1) as pool:
-        waiting = [pool.submit(kernel, start, stop) for start, stop in list(pairwise(edges))[1:]]
-        kernel(edges[0], edges[1])
-        for block in waiting:
-            block.result()
+    blocks = min(PIECES * threads, most)
+    edges = [length * i // blocks for i in range(blocks + 1)]
+    left, lock = iter(pairwise(edges)), Lock()
+
+    def work() -> None:
+        while True:
+            with lock:
+                block = next(left, None)
+            if block is None:
+                return
+            kernel(*block)
+
+    with ThreadPoolExecutor(threads - 1) as pool:
+        waiting = [pool.submit(work) for _ in range(threads - 1)]
+        work()
+        for helper in waiting:
+            helper.result()

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 
+from beambox.simulate.ellipsoids import NO_HIT, hit_ellipsoid
 from beambox.simulate.ground import ground_height, ground_surface
 from beambox.simulate.shapes import Shape, rotation
 
 __all__ = ["Hits", "Placed", "cast", "pack"]
 
-_NO_HIT = 1e9
 _TILT_MARGIN = 0.15  # metres added around footprints, for objects that lean
 
 
@@ -177,16 +177,16 @@ def _columns(bounds: np.ndarray, azimuths: np.ndarray, margin: float) -> tuple[n
 
 @numba.njit(cache=True, nogil=True)
 def _hit_ground(g: np.ndarray, oz: float, dx: float, dy: float, dz: float, limit: float) -> float:
-    """Distance at which a beam meets the ground, or _NO_HIT: regula falsi on the height above it."""
+    """Distance at which a beam meets the ground, or NO_HIT: regula falsi on the height above it."""
     low, f_low, high, f_high = 0.0, oz - ground_height(g, 0.0, 0.0), -1.0, 0.0
     if f_low <= 0:
-        return _NO_HIT
+        return NO_HIT
     fall = g[1] * dx + g[2] * dy - dz
     t = f_low / max(fall, 0.004)
     for step in range(40):
         if high < 0 and t > limit:
             if low >= limit - 1e-6:
-                return _NO_HIT
+                return NO_HIT
             t = limit
         f = oz + dz * t - ground_height(g, dx * t, dy * t)
         if abs(f) < 0.002:
@@ -203,7 +203,7 @@ def _hit_ground(g: np.ndarray, oz: float, dx: float, dy: float, dz: float, limit
             t = low + (high - low) * f_low / (f_low - f_high)
         if high >= 0 and high - low < 0.002:
             return high
-    return high if high >= 0 else _NO_HIT
+    return high if high >= 0 else NO_HIT
 
 
 @numba.njit(cache=True, nogil=True)
@@ -216,38 +216,26 @@ def _hit_part(
     ray: tuple[float, float, float, float],
     chance: tuple[np.uint64, int, int],
 ) -> tuple[float, int, float]:
-    """Distance at which a beam meets a part, its material, and the cosine of incidence; distance _NO_HIT for a miss."""
+    """Distance at which a beam meets a part, its material, and the cosine of incidence; distance NO_HIT for a miss."""
     oz, dx, dy, dz = ray
     cx, cy, cz = part[3], part[4], part[5] - oz
     along = cx * dx + cy * dy + cz * dz
     if cx * cx + cy * cy + cz * cz - along * along > part[6] * part[6] or along < -part[6]:
-        return _NO_HIT, 0, 0.0
+        return NO_HIT, 0, 0.0
     first, last = int(part[1]), int(part[2])
-    enter, leave, face_in, face_out, cos_in, cos_out = 0.0, _NO_HIT, int(part[8]), int(part[8]), 1.0, 1.0
+    enter, leave, face_in, face_out, cos_in, cos_out = 0.0, NO_HIT, int(part[8]), int(part[8]), 1.0, 1.0
     if part[0] > 0.5:
-        m = ellipsoids[first]
-        ux, uy, uz = (m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz, m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz,
-                      m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz)  # fmt: skip
-        vx, vy, vz = (m[0, 0] * cx + m[0, 1] * cy + m[0, 2] * cz, m[1, 0] * cx + m[1, 1] * cy + m[1, 2] * cz,
-                      m[2, 0] * cx + m[2, 1] * cy + m[2, 2] * cz)  # fmt: skip
-        a, b, c = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz - 1.0
-        root = b * b - a * c
-        if root <= 0:
-            return _NO_HIT, 0, 0.0
-        root = math.sqrt(root)
-        enter, leave = (b - root) / a, (b + root) / a
-        wx, wy, wz = ux * enter - vx, uy * enter - vy, uz * enter - vz
-        nx, ny, nz = (m[0, 0] * wx + m[1, 0] * wy + m[2, 0] * wz, m[0, 1] * wx + m[1, 1] * wy + m[2, 1] * wz,
-                      m[0, 2] * wx + m[1, 2] * wy + m[2, 2] * wz)  # fmt: skip
-        cos_in = abs(nx * dx + ny * dy + nz * dz) / math.sqrt(nx * nx + ny * ny + nz * nz)
+        enter, leave, cos_in = hit_ellipsoid(ellipsoids[first], cx, cy, cz, dx, dy, dz)
+        if enter == NO_HIT:
+            return NO_HIT, 0, 0.0
     else:
-        enter = -_NO_HIT
+        enter = -NO_HIT
         for f in range(first, last):
             slope = planes[f, 0] * dx + planes[f, 1] * dy + planes[f, 2] * dz
             away = planes[f, 3] - planes[f, 2] * oz
             if abs(slope) < 1e-12:
                 if away < 0:
-                    return _NO_HIT, 0, 0.0
+                    return NO_HIT, 0, 0.0
                 continue
             t = away / slope
             if slope < 0:
@@ -256,25 +244,25 @@ def _hit_part(
             elif t < leave:
                 leave, face_out, cos_out = t, plane_material[f], slope
             if enter > leave:
-                return _NO_HIT, 0, 0.0
+                return NO_HIT, 0, 0.0
     if enter <= 0 or leave <= enter:
-        return _NO_HIT, 0, 0.0
+        return NO_HIT, 0, 0.0
     seed, beam, number = chance
     if part[7] > 0:
         depth = -math.log(1.0 - _uniform(seed, beam, 4 * number)) / part[7]
         t = enter + depth
-        return (t, face_in, 0.3 + 0.7 * _uniform(seed, beam, 4 * number + 1)) if t < leave else (_NO_HIT, 0, 0.0)
+        return (t, face_in, 0.3 + 0.7 * _uniform(seed, beam, 4 * number + 1)) if t < leave else (NO_HIT, 0, 0.0)
     if _uniform(seed, beam, 4 * number + 2) >= table[face_in, 5]:
         return enter, face_in, cos_in
     if _uniform(seed, beam, 4 * number + 3) >= table[face_out, 5]:
         return leave, face_out, cos_out
-    return _NO_HIT, 0, 0.0
+    return NO_HIT, 0, 0.0
 
 
 @numba.njit(cache=True, nogil=True)
 def _misses(pose: np.ndarray, reach: np.ndarray, oz: float, dx: float, dy: float, dz: float) -> bool:
     """Tell whether a beam passes the box around an object, in the object's own frame."""
-    enter, leave = 0.0, _NO_HIT
+    enter, leave = 0.0, NO_HIT
     for k in range(3):
         slope = pose[k] * dx + pose[3 + k] * dy + pose[6 + k] * dz
         start = -pose[k] * pose[9] - pose[3 + k] * pose[10] + pose[6 + k] * (oz - pose[11])
@@ -316,7 +304,7 @@ def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out
             best = _hit_ground(ground, oz, dx, dy, se, limit)
             floor = best
             who, what, cos = -2, 0, 1.0
-            if best < _NO_HIT:
+            if best < NO_HIT:
                 x, y = dx * best, dy * best
                 who, what = -1, ground_surface(ground, x, y)
                 h = ground_height(ground, x, y)
@@ -333,7 +321,7 @@ def _cast(packed, ground, table, seed, azimuths, phases, beams, limit, step, out
                     continue
                 if _misses(poses[o], reaches[o], oz, dx, dy, se):
                     continue
-                mine, my_material, my_cos = _NO_HIT, 0, 1.0
+                mine, my_material, my_cos = NO_HIT, 0, 1.0
                 for p in range(part_start[o], part_start[o + 1]):
                     t, m, cosine_here = _hit_part(
                         parts[p], planes, plane_material, ellipsoids, table, (oz, dx, dy, se), (seed, beam, p)

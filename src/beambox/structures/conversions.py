@@ -11,6 +11,7 @@ import base64
 import html
 import io
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,6 @@ from beambox.geometry.calibration import Calibration
 from beambox.io import write_bytes, write_text
 
 if TYPE_CHECKING:
-    import supervision
     from PIL.Image import Image
 
     from beambox.structures.detections import Detections
@@ -163,12 +163,10 @@ def frame_from_file(path: Path, fields: str | Sequence[str] | None, intensity_sc
     return read_frame(path, fields=fields, intensity_scale=intensity_scale)
 
 
-def to_supervision(
-    found: Detections, calibration: Calibration, image_size: tuple[int, int] | None
-) -> supervision.Detections:
+def to_supervision(found: Detections, calibration: Calibration, image_size: tuple[int, int] | None) -> Any:
     """See :meth:`Detections.to_supervision`."""
     try:
-        import supervision
+        supervision: Any = import_module("supervision")
     except ImportError:
         raise BeamboxError("this needs supervision, which is not installed: pip install supervision") from None
     boxes = found.boxes.detach().cpu()
@@ -177,7 +175,7 @@ def to_supervision(
     camera = calibration.to_camera(seen.boxes.detach().cpu(), image_size)
     arrays = seen.to_numpy()
     return supervision.Detections(
-        xyxy=camera.image.float().numpy().reshape(-1, 4),
+        xyxy=camera.image.float().reshape(-1, 4).numpy(),
         confidence=arrays["scores"],
         class_id=arrays["class_ids"],
         data={"class_name": arrays["names"], "box3d": arrays["boxes"]},

@@ -5,23 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsIndex, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, cast, overload
 
 import torch
 from torch import Tensor
 
 from beambox import __version__
 from beambox.checks import BeamboxError, did_you_mean, expect_same_length, expect_shape, printable
+from beambox.file_names import name_to_word
 from beambox.geometry.boxes import corners_3d
 from beambox.geometry.calibration import Calibration
-from beambox.io import name_to_word
 from beambox.structures import conversions, rows
-from beambox.structures.selecting import Index, as_numbers, positions, same_fields
+from beambox.structures.selecting import Index, as_numbers, floats, integers, positions, rows_of, same_fields
 
 if TYPE_CHECKING:
     import numpy as np
-    import pandas
-    import supervision
+    import pandas  # pyright: ignore[reportMissingTypeStubs]
     from numpy.typing import ArrayLike
     from PIL.Image import Image
 
@@ -114,13 +113,13 @@ class Detections:
             at = chosen.to(self.scores.device)
             return replace(self, boxes=self.boxes[at], scores=self.scores[at], class_ids=self.class_ids[at])
         kind = int(self.class_ids[chosen])
-        box = tuple(self.boxes[chosen].tolist())
+        box = tuple(floats(self.boxes[chosen]))
         return Detection(self.classes[kind], float(self.scores[chosen]), box, kind, self.frame_id)
 
     def __iter__(self) -> Iterator[Detection]:
         """Yield each :class:`Detection`, in order."""
-        boxes, scores = self.boxes.tolist(), self.scores.tolist()
-        for box, score, kind in zip(boxes, scores, self.class_ids.tolist()):
+        boxes, scores = rows_of(self.boxes), floats(self.scores)
+        for box, score, kind in zip(boxes, scores, integers(self.class_ids)):
             yield Detection(self.classes[kind], score, tuple(box), kind, self.frame_id)
 
     def __eq__(self, other: object) -> bool:
@@ -145,7 +144,7 @@ class Detections:
     @property
     def names(self) -> list[str]:
         """Class name of each detection."""
-        return [self.classes[i] for i in self.class_ids.tolist()]
+        return [self.classes[i] for i in integers(self.class_ids)]
 
     @property
     def corners(self) -> Tensor:
@@ -155,7 +154,7 @@ class Detections:
     @property
     def distances(self) -> Tensor:
         """``(N,)`` metres from the origin of the LiDAR frame to the centers of the boxes, in 3-D (as ONCE's bands)."""
-        return self.boxes[:, :3].norm(dim=1)
+        return self.boxes[:, :3].square().sum(dim=1).sqrt()
 
     # --- selections and copies ----------------------------------------------------------------------------------------
 
@@ -250,9 +249,11 @@ class Detections:
     def from_json(cls, text: str, where: str = "the text") -> Detections:
         """Read what :meth:`to_json` wrote; ``where`` is what errors call it."""
         content, found = rows.parse_json(text, where, "detections", COLUMNS[1:])
-        classes = content.get("classes")
-        if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
-            raise BeamboxError(f'{where} must have the names of the classes under "classes", got {classes!r:.80}')
+        given = content.get("classes")
+        listed = cast("list[object]", given) if isinstance(given, list) else []
+        classes = [name for name in listed if isinstance(name, str)]
+        if not isinstance(given, list) or len(classes) < len(listed):
+            raise BeamboxError(f'{where} must have the names of the classes under "classes", got {given!r:.80}')
         return _from_rows(found, classes, str(content.get("frame", "")), where)
 
     def to_csv(self) -> str:
@@ -289,7 +290,7 @@ class Detections:
         )  # (N, 13)
         lines = (
             f"{name_to_word(name)} -1 -1 " + " ".join(f"{value:.4f}" for value in row) + "\n"
-            for name, row in zip(self.names, columns.tolist())
+            for name, row in zip(self.names, rows_of(columns))
         )
         return "".join(lines)
 
@@ -300,9 +301,7 @@ class Detections:
         """Read KITTI's result lines; classes are those that occur, sorted, where none are given."""
         return conversions.detections_from_kitti(text, calibration, classes, frame_id)
 
-    def to_supervision(
-        self, calibration: Calibration, image_size: tuple[int, int] | None = None
-    ) -> supervision.Detections:
+    def to_supervision(self, calibration: Calibration, image_size: tuple[int, int] | None = None) -> Any:
         """Return the boxes in the camera image as ``supervision.Detections``; those behind the camera are left out.
 
         ``data`` holds ``class_name`` and ``box3d``, the ``(N, 7)`` boxes.

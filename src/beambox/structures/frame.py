@@ -19,7 +19,7 @@ from beambox.structures.selecting import Index, as_numbers, positions, same_fiel
 
 if TYPE_CHECKING:
     import numpy as np
-    import pandas
+    import pandas  # pyright: ignore[reportMissingTypeStubs]
     from numpy.typing import ArrayLike
     from PIL.Image import Image
 
@@ -66,7 +66,7 @@ class Frame:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        if not isinstance(self.points, Tensor):
+        if not isinstance(self.points, Tensor):  # pyright: ignore[reportUnnecessaryIsInstance]  # arrays are taken too
             object.__setattr__(self, "points", as_numbers("points", self.points, torch.float32))
         if self.points.dim() != 2 or self.points.shape[1] < 4:
             raise BeamboxError(

@@ -14,11 +14,11 @@ from beambox.checks import BeamboxError, expect_finite, expect_same_length, expe
 from beambox.geometry.boxes import corners_3d
 from beambox.geometry.calibration import Calibration
 from beambox.structures import conversions, rows
-from beambox.structures.selecting import Index, as_numbers, positions, same_fields
+from beambox.structures.selecting import Index, as_numbers, floats, integers, positions, rows_of, same_fields
 
 if TYPE_CHECKING:
     import numpy as np
-    import pandas
+    import pandas  # pyright: ignore[reportMissingTypeStubs]
     from numpy.typing import ArrayLike
     from PIL.Image import Image
 
@@ -137,14 +137,14 @@ class Labels:
         """Select: a number gives one :class:`Label`; a slice, a mask or positions give labels."""
         chosen = positions(index, len(self))
         if isinstance(chosen, int):
-            return Label(self.names[chosen], tuple(self.boxes[chosen].tolist()))
+            return Label(self.names[chosen], tuple(floats(self.boxes[chosen])))
         attributes = None if self.attributes is None else self.attributes[chosen]
-        names = tuple(self.names[i] for i in chosen.tolist())
+        names = tuple(self.names[i] for i in integers(chosen))
         return replace(self, boxes=self.boxes[chosen], names=names, attributes=attributes)
 
     def __iter__(self) -> Iterator[Label]:
         """Yield each :class:`Label`, in order."""
-        return (Label(name, tuple(box)) for name, box in zip(self.names, self.boxes.tolist()))
+        return (Label(name, tuple(box)) for name, box in zip(self.names, rows_of(self.boxes)))
 
     def __eq__(self, other: object) -> bool:
         """Whether every field is equal, tensors value by value."""
@@ -171,7 +171,7 @@ class Labels:
     @property
     def distances(self) -> Tensor:
         """``(N,)`` metres from the origin of the LiDAR frame to the centers of the boxes, in 3-D."""
-        return self.boxes[:, :3].norm(dim=1)
+        return self.boxes[:, :3].square().sum(dim=1).sqrt()
 
     def class_index(self, classes: Sequence[str]) -> Tensor:
         """Return each object's position in ``classes``, or -1: ``(N,)`` int64."""

@@ -8,17 +8,18 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from beambox import io
-from beambox.checks import BeamboxError, printable
+from beambox.checks import BeamboxError, import_library, printable
 
 if TYPE_CHECKING:
     import numpy as np
-    import pandas
+    import pandas  # pyright: ignore[reportMissingTypeStubs]
 
 __all__ = [
     "BOX",
+    "Record",
     "counted",
     "csv_text",
     "frame_of_array",
@@ -33,6 +34,8 @@ BOX = ("x", "y", "z", "l", "w", "h", "yaw")
 """Columns of a box: metres and radians."""
 
 Row = Mapping[str, float | str]
+Record: TypeAlias = dict[str, Any]
+"""A row that was read: text under ``name``, finite numbers under the other columns."""
 
 
 def rounded(rows: Iterable[Row]) -> list[dict[str, float | str]]:
@@ -40,7 +43,7 @@ def rounded(rows: Iterable[Row]) -> list[dict[str, float | str]]:
     return [{key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows]
 
 
-def json_text(rows: Sequence[Row], head: Mapping[str, Any], under: str) -> str:
+def json_text(rows: Sequence[Row], head: Mapping[str, object], under: str) -> str:
     """Write one JSON object: what ``head`` holds, and the rows as a list, one per line."""
     objects = ",\n".join("    " + json.dumps(row) for row in rows)
     start = json.dumps(head, indent=2)[:-2] + ",\n" if head else "{\n"
@@ -56,7 +59,7 @@ def csv_text(rows: Iterable[Row], columns: Sequence[str]) -> str:
     return text.getvalue()
 
 
-def parse_csv(text: str, where: str, columns: Sequence[str]) -> list[dict[str, Any]]:
+def parse_csv(text: str, where: str, columns: Sequence[str]) -> list[Record]:
     """Read rows below a header line; numbers are finite.
 
     Raises:
@@ -72,37 +75,38 @@ def parse_csv(text: str, where: str, columns: Sequence[str]) -> list[dict[str, A
         raise BeamboxError(f"{where} is no CSV: {error}") from None
 
 
-def parse_json(
-    text: str, where: str, under: str, columns: Sequence[str]
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def parse_json(text: str, where: str, under: str, columns: Sequence[str]) -> tuple[dict[str, object], list[Record]]:
     """Read what :func:`json_text` wrote: the whole object, and its rows with finite numbers.
 
     Raises:
         BeamboxError: naming the entry.
     """
-    content = io.parse_json(text, where)
-    rows = content.get(under) if isinstance(content, dict) else None
-    if not isinstance(rows, list):
+    content: object = io.parse_json(text, where)
+    rows = cast("dict[str, object]", content).get(under) if isinstance(content, dict) else None
+    if not isinstance(content, dict) or not isinstance(rows, list):
         raise BeamboxError(f'{where} must hold an object with a list under "{under}", as beambox writes it')
-    return content, [_row(row, columns, f"{where}, entry {number}") for number, row in enumerate(rows, start=1)]
+    numbered = enumerate(cast("list[object]", rows), start=1)
+    whole = cast("dict[str, object]", content)
+    return whole, [_row(row, columns, f"{where}, entry {number}") for number, row in numbered]
 
 
-def _row(row: object, columns: Sequence[str], place: str) -> dict[str, Any]:
-    if not isinstance(row, dict) or any(row.get(key) is None for key in columns):
+def _row(row: object, columns: Sequence[str], place: str) -> Record:
+    known = cast("dict[str, Any]", row) if isinstance(row, dict) else {}
+    if any(known.get(key) is None for key in columns):
         raise BeamboxError(f"{place}: expected {', '.join(columns)}, got {row!r:.120}")
-    out: dict[str, Any] = {}
+    out: Record = {}
     for key in columns:
         if key == "name":
-            if not isinstance(row[key], str):
-                raise BeamboxError(f"{place}: the name must be text, got {row[key]!r:.80}")
-            out[key] = row[key]
+            if not isinstance(known[key], str):
+                raise BeamboxError(f"{place}: the name must be text, got {known[key]!r:.80}")
+            out[key] = known[key]
             continue
         try:
-            out[key] = float(row[key]) if not isinstance(row[key], bool) else math.nan
+            out[key] = float(known[key]) if not isinstance(known[key], bool) else math.nan
         except (TypeError, ValueError, OverflowError):
             out[key] = math.nan
         if not math.isfinite(out[key]) or abs(out[key]) > 1e30:  # beyond float32
-            raise BeamboxError(f"{place}: {key} must be a finite number, got {row[key]!r:.80}")
+            raise BeamboxError(f"{place}: {key} must be a finite number, got {known[key]!r:.80}")
     return out
 
 
@@ -121,11 +125,7 @@ def frame_of_array(array: np.ndarray, columns: Sequence[str]) -> pandas.DataFram
 
 
 def _pandas() -> Any:
-    try:
-        import pandas
-    except ImportError:
-        raise BeamboxError("tables need pandas, which is not installed: pip install pandas") from None
-    return pandas
+    return import_library("pandas", "tables", "a table")
 
 
 def counted(names: Sequence[str]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, SupportsIndex
+from typing import TYPE_CHECKING, Any, SupportsIndex, cast
 
 import numpy as np
 import torch
@@ -17,9 +17,9 @@ from beambox.checks import BeamboxError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["Index", "as_numbers", "positions", "same_fields"]
+__all__ = ["Index", "as_numbers", "floats", "integers", "positions", "rows_of", "same_fields"]
 
-Index = slice | Sequence[int] | Sequence[bool] | Tensor | NDArray[np.bool_] | NDArray[np.integer]
+Index = slice | Sequence[int] | Sequence[bool] | Tensor | NDArray[np.bool_] | NDArray[np.integer[Any]]
 """What selects several entries: a slice, a mask of the whole length, or positions."""
 
 
@@ -46,7 +46,7 @@ def positions(index: Index | SupportsIndex, length: int) -> Tensor | int:
         return torch.zeros(0, dtype=torch.int64)
     if chosen.dim() != 1 or chosen.is_floating_point() or chosen.is_complex():
         raise _no_index(index)
-    outside = [i for i in chosen.tolist() if not -length <= i < length]
+    outside = [i for i in integers(chosen) if not -length <= i < length]
     if outside:
         raise IndexError(f"position {outside[0]} lies outside of {length} entries")
     return torch.where(chosen < 0, chosen + length, chosen).to(torch.int64)
@@ -54,10 +54,10 @@ def positions(index: Index | SupportsIndex, length: int) -> Tensor | int:
 
 def _position(index: object, length: int) -> int:
     try:
-        position = operator.index(index)  # pyright: ignore[reportArgumentType]  # refused below
+        position = operator.index(cast("SupportsIndex", index))  # refused below where it is none
     except TypeError:
         raise _no_index(index) from None
-    if isinstance(index, bool | np.bool_) or (isinstance(index, Tensor) and index.dtype == torch.bool):
+    if isinstance(index, bool) or getattr(index, "dtype", None) in (torch.bool, np.dtype(bool)):
         raise _no_index(index)
     if not -length <= position < length:
         raise IndexError(f"position {position} lies outside of {length} entries")
@@ -66,6 +66,21 @@ def _position(index: object, length: int) -> int:
 
 def _no_index(index: object) -> BeamboxError:
     return BeamboxError(f"an index is a number, a slice, a mask or a list of positions, got {index!r:.80}")
+
+
+def floats(values: Tensor) -> list[float]:
+    """Return ``(N,)`` values as Python's numbers."""
+    return values.tolist()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]  # as torch types it
+
+
+def rows_of(values: Tensor) -> list[list[float]]:
+    """Return ``(N, C)`` values as Python's numbers."""
+    return values.tolist()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]  # as torch types it
+
+
+def integers(values: Tensor) -> list[int]:
+    """Return ``(N,)`` whole numbers as Python's."""
+    return values.tolist()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]  # as torch types it
 
 
 def same_fields(one: DataclassInstance, other: DataclassInstance) -> bool:
@@ -89,7 +104,8 @@ def as_numbers(name: str, values: object, dtype: torch.dtype) -> Tensor:
     if isinstance(values, Tensor) and values.is_floating_point() and dtype.is_floating_point:
         return values
     try:
-        tensor = torch.as_tensor(np.asarray(values) if isinstance(values, list | tuple) else values)
+        listed = isinstance(values, list | tuple)
+        tensor = torch.as_tensor(np.asarray(cast("Sequence[object]", values)) if listed else values)
     except (TypeError, ValueError, RuntimeError):
         raise BeamboxError(f"`{name}` must hold numbers, got {values!r:.80}") from None
     if tensor.dtype.is_complex or (tensor.is_floating_point() and not dtype.is_floating_point and tensor.numel()):

@@ -6,41 +6,21 @@ IROS 2020), with process noise that depends on the time between sweeps.
 
 from __future__ import annotations
 
-import importlib
 import math
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import import_library
+from beambox.geometry.angles import wrap
 from beambox.track.options import TrackerOptions
 
-__all__ = ["BoxFilter", "library"]
+__all__ = ["BoxFilter"]
 
 Floats = NDArray[np.float64]
 YAW, STATE, MEASURED = 3, 10, 7
 ORDER = [0, 1, 2, 6, 3, 4, 5]
 """Columns of a box in the order of the state: x, y, z, yaw, l, w, h."""
-
-
-def library(name: str) -> ModuleType:
-    """Import an optional library of tracking.
-
-    Raises:
-        BeamboxError: with the command that installs it, where it is absent.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise BeamboxError(
-            f"tracking needs the library {name.split('.', maxsplit=1)[0]}: {how_to_install('track')}"
-        ) from None
-
-
-def wrapped(angle: float) -> float:
-    """Return an angle in [-pi, pi)."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 class BoxFilter:
@@ -55,7 +35,7 @@ class BoxFilter:
             speed: standard deviation of the velocity along each axis, metres per second.
         """
         self.options = options
-        self._kalman = library("filterpy.kalman").KalmanFilter(dim_x=STATE, dim_z=MEASURED)
+        self._kalman = import_library("filterpy.kalman", "track", "tracking").KalmanFilter(dim_x=STATE, dim_z=MEASURED)
         self._kalman.H = np.eye(MEASURED, STATE)
         noise = [options.position_noise] * 3 + [options.heading_noise] + [options.size_noise] * 3
         self._kalman.R = np.diag(np.square(noise))
@@ -67,7 +47,7 @@ class BoxFilter:
     def box(self) -> Floats:
         """``(7,)`` x, y, z, l, w, h, yaw."""
         x, y, z, yaw, length, width, height = self._kalman.x[:MEASURED, 0]
-        return np.array([x, y, z, length, width, height, wrapped(yaw)])
+        return np.array([x, y, z, length, width, height, wrap(yaw)])
 
     @property
     def velocity(self) -> Floats:
@@ -103,15 +83,15 @@ class BoxFilter:
         scores of such detections outweigh the others the object is.
         """
         measured = box[ORDER]
-        difference = wrapped(float(measured[0 + YAW] - self._kalman.x[YAW, 0]))
+        difference = wrap(float(measured[0 + YAW] - self._kalman.x[YAW, 0]))
         turned = abs(difference) > math.pi / 2
         self._votes += -score if turned else score
         if turned:
-            difference = wrapped(difference + math.pi)
+            difference = wrap(difference + math.pi)
         measured[YAW] = self._kalman.x[YAW, 0] + difference
         self._kalman.update(measured[:, None])
         self._kalman.x[4:7, 0] = np.maximum(self._kalman.x[4:7, 0], 0.01)
         if self._votes < 0:
             self._kalman.x[YAW, 0] += math.pi
             self._votes = -self._votes
-        self._kalman.x[YAW, 0] = wrapped(self._kalman.x[YAW, 0])
+        self._kalman.x[YAW, 0] = wrap(self._kalman.x[YAW, 0])

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from beambox.checks import BeamboxError
+from beambox.checks import BeamboxError, import_library
 from beambox.structures import Detections
-from beambox.track.kalman import BoxFilter, library
+from beambox.track.kalman import BoxFilter
 from beambox.track.options import TrackerOptions
 from beambox.track.poses import as_pose, carry_boxes, carry_vectors
 from beambox.track.tracks import Tracks
@@ -66,8 +66,8 @@ class Tracker:
         """
         if not (math.isfinite(rate) and rate > 0):
             raise BeamboxError(f"`rate` must be a positive number of sweeps per second, got {rate}")
-        library("filterpy.kalman")
-        self._assign = library("scipy.optimize").linear_sum_assignment
+        import_library("filterpy.kalman", "track", "tracking")
+        self._assign = import_library("scipy.optimize", "track", "tracking").linear_sum_assignment
         self.options = options or TrackerOptions()
         self.rate = rate
         self._next = 1

@@ -15,6 +15,7 @@ from typing import Any
 
 from beambox.checks import BeamboxError
 from beambox.data.source import FrameSource
+from beambox.detectors.contract import AnyModel, module_of
 from beambox.detectors.weights import load_weights
 from beambox.infer.evaluate import Detect, detect_frames, network, scored_frames
 from beambox.io import read_json, write_json
@@ -146,12 +147,12 @@ def reserve(folder: Path, identity: dict[str, Any]) -> None:
     write_json(path, identity)
 
 
-def score(model: Any, source: FrameSource, recipe: Recipe) -> dict[str, Any]:
+def score(model: AnyModel, source: FrameSource, recipe: Recipe) -> dict[str, Any]:
     """Score a detector by the rules of its data, ONCE's for ONCE, else KITTI's; with the time that it took."""
     import torch
 
     assert recipe.validation is not None
-    model = model.to("cuda" if torch.cuda.is_available() else "cpu")
+    module_of(model).to("cuda" if torch.cuda.is_available() else "cpu")
     timed = Timed(network(model))
     frames = scored_frames(detect_frames(timed, source))
     result = score_by(recipe.validation, frames, model.config.classes)

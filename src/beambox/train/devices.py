@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, expect_library
 from beambox.infer.precision import bfloat16_reason
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def choose_precision(wanted: str, device: str) -> str:
         raise BeamboxError("precision float16 needs a GPU; on a CPU take auto, bfloat16 or float32")
     if wanted != "auto":
         return wanted
-    return "float32" if bfloat16_reason(torch.device(device)) else "bfloat16"
+    return "float32" if bfloat16_reason(torch.device(device), training=True) else "bfloat16"
 
 
 def make_fabric(precision: str) -> Fabric:
@@ -48,11 +48,10 @@ def make_fabric(precision: str) -> Fabric:
     Raises:
         BeamboxError: if lightning-fabric is not installed.
     """
-    try:
-        from lightning_fabric import Fabric
-        from lightning_fabric.strategies import DDPStrategy
-    except ImportError:
-        raise BeamboxError(f"training needs the package lightning-fabric: {how_to_install('train')}") from None
+    expect_library("lightning_fabric", "train", "training")
+    from lightning_fabric import Fabric
+    from lightning_fabric.strategies import DDPStrategy
+
     device = "cuda" if torch.cuda.is_available() else "cpu"
     chosen = choose_precision(precision, device)
     world = int(os.environ.get("WORLD_SIZE", "1")) if "TORCHELASTIC_RUN_ID" in os.environ else 1

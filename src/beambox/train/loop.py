@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -110,7 +110,7 @@ def build_run(recipe: Recipe, data: Path | None, out: Path, fabric: Fabric, obje
         reuse: take that file if it is there already.
     """
     detector, notes = build_detector(recipe.detector, recipe.seed)
-    config: Any = detector.config
+    config = detector.config
     check_recipe(recipe, config, fabric.world_size)
     sources = [open_source(section, data) for section in recipe.data]
     joined = MixedSource(sources, tuple(s.weight for s in recipe.data if s.weight is not None) or None)

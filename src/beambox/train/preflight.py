@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
 from beambox.checks import BeamboxError, did_you_mean
 from beambox.data.source import FrameSource
+from beambox.detectors.contract import DetectorConfig
 from beambox.geometry.grid import VoxelGrid
 from beambox.infer.evaluate import check_classes
 from beambox.metrics.once import SUPERCLASS_OF
@@ -22,7 +22,7 @@ LOOKED_AT = 20
 """Frames whose labels are looked at in any case; more only while none of their objects can be learnt."""
 
 
-def check_recipe(recipe: Recipe, config: Any, processes: int) -> None:
+def check_recipe(recipe: Recipe, config: DetectorConfig, processes: int) -> None:
     """Check what the recipe alone can get wrong.
 
     Args:

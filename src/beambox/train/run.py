@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from beambox import __version__
 from beambox.checks import BeamboxError
 from beambox.detectors.catalog import config_to_dict, name_of, options_since, tensors_since
+from beambox.detectors.contract import AnyModel, model_of, module_of
 from beambox.detectors.weights import save_weights
 from beambox.infer.precision import PRECISIONS
 from beambox.train.batchnorm import measure_statistics, measured_statistics
@@ -44,15 +45,17 @@ __all__ = ["ModelWithLoss", "Run", "random_seed"]
 class ModelWithLoss(nn.Module):
     """Network and loss as one module, so that one forward pass of it is all that mixed precision and DDP see."""
 
-    def __init__(self, detector: Any) -> None:
+    def __init__(self, detector: AnyModel) -> None:
         super().__init__()
-        self.detector: Any = detector
+        self.detector = detector
 
     def forward(self, work: TrainingBatch) -> dict[str, Tensor]:
         """Return the named losses of a batch."""
-        predictions = self.detector(work.batch, work.grid, work.batch.labels)
+        labels = work.batch.labels
+        assert labels is not None, "training frames have labels"
+        predictions = self.detector(work.batch, work.grid, labels)
         with torch.autocast(work.batch.points.device.type, enabled=False):
-            return self.detector.loss(predictions, work.batch.labels)
+            return self.detector.loss(predictions, labels)
 
 
 def random_seed(seed: int, step: int, rank: int) -> int:
@@ -73,7 +76,9 @@ def _settle_strides(detector: nn.Module) -> None:
 class Run:
     """A detector in training: everything that changes from step to step, and how to save and restore it."""
 
-    def __init__(self, recipe: Recipe, detector: Any, dataset: TrainingDataset, fabric: Fabric, folder: Path) -> None:
+    def __init__(
+        self, recipe: Recipe, detector: AnyModel, dataset: TrainingDataset, fabric: Fabric, folder: Path
+    ) -> None:
         self.recipe, self.detector, self.dataset, self.fabric, self.folder = recipe, detector, dataset, fabric, folder
         optim = recipe.optim
         per_epoch = len(dataset.source) / optim.batch
@@ -86,14 +91,16 @@ class Run:
         self.notes: list[str] = []
         """What to say before the first step."""
         self.validator: Validator | None = None
-        detector.to(memory_format=torch.channels_last)
+        network = module_of(detector)
+        network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # torch's overloads lack it
         if recipe.sync_batchnorm and fabric.world_size > 1 and fabric.device.type == "cuda":
-            detector = nn.SyncBatchNorm.convert_sync_batchnorm(detector)
+            network = nn.SyncBatchNorm.convert_sync_batchnorm(network)
         if fabric.world_size > 1:
-            _settle_strides(detector)
-        self.module, self.optimizer = fabric.setup(ModelWithLoss(detector), adam(detector.parameters(), optim))
-        self.ema = Ema(detector, recipe.ema.decay) if recipe.ema else None
-        self.names = {parameter: name for name, parameter in detector.named_parameters()}
+            _settle_strides(network)
+        work = ModelWithLoss(model_of(network))
+        self.module, self.optimizer = fabric.setup(work, adam(network.parameters(), optim))
+        self.ema = Ema(network, recipe.ema.decay) if recipe.ema else None
+        self.names = {parameter: name for name, parameter in network.named_parameters()}
         if recipe.compile:
             for layer in self.detector.dense:
                 layer.compile(dynamic=False)  # every step has maps of the same size
@@ -104,9 +111,9 @@ class Run:
         return PRECISIONS[choose_precision(self.recipe.precision, self.fabric.device.type)]
 
     @property
-    def result(self) -> nn.Module:
-        """The module that is validated and exported: the average where there is one."""
-        return self.ema.module if self.ema else self.detector
+    def result(self) -> AnyModel:
+        """The detector that is validated and exported: the average where there is one."""
+        return model_of(self.ema.module) if self.ema else self.detector
 
     def train_step(self, work: TrainingBatch, timer: Timer) -> tuple[dict[str, Tensor], float]:
         """Make one optimiser step; returns the losses, with ``total``, and the learning rate.
@@ -193,7 +200,7 @@ class Run:
         if saved.detector["name"] != own["name"]:
             raise BeamboxError(f"{path} is of the detector {saved.detector['name']}, the recipe is of {own['name']}")
         tensors = tensors_since(self.detector, saved.tensors)
-        restore_module(self.detector, part(tensors, "model."), str(path))
+        restore_module(module_of(self.detector), part(tensors, "model."), str(path))
         restore_optimizer(self.optimizer.optimizer, self.names, part(tensors, "optim."))
         if self.ema and "ema_updates" in saved.state:
             restore_module(self.ema.module, part(tensors, "ema."), str(path))
@@ -214,7 +221,7 @@ class Run:
         The batches are those of the last steps, so what is measured is a function of the weights, the seed and the
         step. All processes enter together.
         """
-        with measured_statistics(self.result, self._measure):
+        with measured_statistics(module_of(self.result), self._measure):
             yield
 
     def _measure(self) -> None:
@@ -230,7 +237,7 @@ class Run:
                 network(work[1].to(self.fabric.device))
 
         gather = self.fabric.all_gather if self.fabric.world_size > 1 else None
-        measure_statistics(self.result, numbered, forward, gather)  # pyright: ignore[reportArgumentType]
+        measure_statistics(module_of(self.result), numbered, forward, gather)  # pyright: ignore[reportArgumentType]
 
     def export(self, name: str, scores: Mapping[str, Any]) -> Path:
         """Write the weights a user loads, with a card of where they come from (by the first process alone)."""

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 from beambox.checks import BeamboxError
 from beambox.detectors.catalog import build, options_since, tensors_since
+from beambox.detectors.contract import AnyModel
 from beambox.detectors.weights import WeightFile, read_weights, warn_of_licence
 from beambox.train.config import DetectorSection
 from beambox.zoo import find_weights
@@ -19,7 +19,7 @@ __all__ = ["build_detector", "take_over"]
 SHOWN = 6
 
 
-def build_detector(section: DetectorSection, seed: int) -> tuple[nn.Module, list[str]]:
+def build_detector(section: DetectorSection, seed: int) -> tuple[AnyModel, list[str]]:
     """Build a recipe's detector, from random weights or from those that it starts from.
 
     Args:
@@ -45,7 +45,7 @@ def build_detector(section: DetectorSection, seed: int) -> tuple[nn.Module, list
     return detector, take_over(detector, stored, section.start_from)
 
 
-def _fresh(name: str, options: dict[str, Any], seed: int) -> nn.Module:
+def _fresh(name: str, options: dict[str, Any], seed: int) -> AnyModel:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return build(name, options)
@@ -61,7 +61,7 @@ def _over(base: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def take_over(detector: nn.Module, stored: WeightFile, where: str) -> list[str]:
+def take_over(detector: AnyModel, stored: WeightFile, where: str) -> list[str]:
     """Copy all tensors that fit by name and shape; returns lines that say so and name what did not.
 
     Raises:

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from beambox.data.source import FrameSource, SubsetSource
+from beambox.detectors.contract import AnyModel
 from beambox.infer.evaluate import detect_frames, network, score_frames, score_once, scored_frames
 from beambox.metrics.kitti import KittiFrame
 from beambox.metrics.kitti_result import KittiResult
@@ -59,7 +60,7 @@ class Validator:
         """
         self.section, self.source, self.dtype = section, source, dtype
 
-    def __call__(self, model: Any, rank: int = 0, processes: int = 1) -> Score:
+    def __call__(self, model: AnyModel, rank: int = 0, processes: int = 1) -> Score:
         """Score a detector; its training mode is restored.
 
         Args:

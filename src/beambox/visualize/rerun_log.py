@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, import_library
 from beambox.io import replacing
 from beambox.structures import Detections, Frame, Labels
 from beambox.visualize.colors import TRUTH, class_color, gradient
@@ -24,11 +24,7 @@ def import_rerun() -> Any:
     Raises:
         BeamboxError: saying how to install it.
     """
-    try:
-        import rerun  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise BeamboxError(f"the viewer needs rerun-sdk, which is not installed: {how_to_install('rerun')}") from None
-    return rerun
+    return import_library("rerun", "rerun", "the viewer")
 
 
 class RerunLog:

@@ -84,7 +84,8 @@ def repeated_kinds(numbers: np.ndarray, assumed: int = 4) -> int:
         numbers: ``(N,)`` as they stand in the file.
         assumed: number of columns to keep in doubt.
     """
-    numbers = numbers[:FIRST].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # signalling NaN in what is no sweep
+        numbers = numbers[:FIRST].astype(np.float64)
     if len(numbers) < FEWEST:
         return assumed
     numbers = np.nan_to_num(numbers, nan=0.0, posinf=0.0, neginf=0.0)

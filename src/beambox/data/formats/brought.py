@@ -1,4 +1,4 @@
-"""Readers that other installed packages bring, as entry points of ``beambox.readers``: see docs/add_reader.md."""
+"""Readers of other installed packages: entry points of the group ``beambox.readers``, see docs/add_reader.md."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from beambox.checks import BeamboxError, MissingFileError, how_to_install
+from beambox.checks import BeamboxError, MissingFileError, import_library
 
 __all__ = ["Columns", "decode", "library"]
 
@@ -34,18 +33,9 @@ class Columns:
 
 
 def library(name: str, path: Path, extra: str = "formats") -> ModuleType:
-    """Import an optional library that reads a format.
-
-    Raises:
-        BeamboxError: with the command that installs it, where it is absent.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise BeamboxError(
-            f"reading {path.suffix or 'such'} files ({path.name}) needs the library {name.split('.', maxsplit=1)[0]}: "
-            f"{how_to_install(extra)}; or convert the file to .npy"
-        ) from None
+    """Import an optional library that reads a format; see :func:`beambox.checks.import_library`."""
+    what = f"reading {path.suffix or 'such'} files ({path.name})"
+    return import_library(name, extra, what, "or convert the file to .npy")
 
 
 def decode(path: Path, kind: str, read: Callable[[], T]) -> T:

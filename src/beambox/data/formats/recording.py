@@ -17,7 +17,7 @@ from beambox.data.formats.columns import Columns, decode, library
 from beambox.data.formats.kept import kept_open
 from beambox.data.formats.point_cloud2 import cloud_columns
 from beambox.data.formats.unpacking import bound_rosbags
-from beambox.io import check_file_name
+from beambox.file_names import check_file_name
 
 __all__ = ["ENDINGS", "read_message", "recording_of", "sweeps_in"]
 

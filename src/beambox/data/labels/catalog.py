@@ -225,7 +225,7 @@ def write_labels(frames: Frames, kind: str, out: Path) -> list[Path]:
 
 def check_part(part: str, kind: str) -> str:
     """Refuse a part of a frame's name that would lead elsewhere."""
-    from beambox.io import check_file_name
+    from beambox.file_names import check_file_name
 
     return check_file_name(part, f"a frame of the {kind} labels")
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beambox.checks import BeamboxError
+from beambox.geometry.angles import wrap
 
-__all__ = ["LabeledFrame", "Reader", "member", "vector", "wrap"]
+__all__ = ["LabeledFrame", "Reader", "member", "vector"]
 
 Floats = NDArray[np.float64]
 TILT = 0.02
@@ -114,11 +115,6 @@ class Reader:
             ids if any(ids) else (),
             tuple(place for _, _, _, place in rows),
         )
-
-
-def wrap(angle: float) -> float:
-    """Return an angle in [-pi, pi], as it is where it lies there already."""
-    return angle if -math.pi <= angle <= math.pi else math.remainder(angle, 2 * math.pi)
 
 
 def member(value: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:

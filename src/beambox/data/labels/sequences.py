@@ -18,7 +18,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from beambox.checks import BeamboxError
-from beambox.data.labels.frames import LabeledFrame, Reader, member, vector, wrap
+from beambox.data.labels.frames import LabeledFrame, Reader, member, vector
+from beambox.geometry.angles import wrap
 
 __all__ = [
     "format_datumaro",

@@ -15,7 +15,8 @@ import math
 from collections.abc import Iterable, Mapping
 
 from beambox.checks import BeamboxError, did_you_mean
-from beambox.data.labels.frames import LabeledFrame, Reader, wrap
+from beambox.data.labels.frames import LabeledFrame, Reader
+from beambox.geometry.angles import wrap
 
 __all__ = ["format_csv", "format_pandaset", "format_text", "parse_csv", "parse_pandaset", "parse_text"]
 

@@ -89,10 +89,13 @@ class KeypointLayout:
 
         An anchor is not fixed in the box: its row, the last, holds zeros.
         """
+        return torch.tensor(_places(self), dtype=torch.float64)
+
+    def _unit(self) -> list[tuple[float, float]]:
+        """Compute :meth:`unit` without tensors, whose values are not known while a graph is traced."""
         points: list[tuple[float, float]] = []
         if self.m:
-            along = torch.linspace(0.5, -0.5, self.m, dtype=torch.float64).tolist()
-            across = torch.linspace(0.5, -0.5, self.n, dtype=torch.float64).tolist()
+            along, across = _falling(self.m), _falling(self.n)
             points += [(0.5, v) for v in across]
             points += [(u, -0.5) for u in along[1:]]
             points += [(-0.5, -v) for v in across[1:]]
@@ -100,7 +103,7 @@ class KeypointLayout:
         points += [(i / self.d - 0.5, j / self.e - 0.5) for i in range(1, self.d) for j in range(1, self.e)]
         if self.d and self.extra_point is not ExtraPoint.NONE:
             points.append((0.0, 0.0))
-        return torch.tensor(points, dtype=torch.float64)
+        return points
 
     def points(self, boxes: Tensor, anchors: Tensor) -> Tensor:
         """Place the keypoints of boxes, in BEV (KASSD, equation 3, corrected; see ``docs/kassd.md``).
@@ -123,7 +126,13 @@ class KeypointLayout:
 @cache
 def _places(layout: KeypointLayout) -> tuple[tuple[float, ...], ...]:
     """Return what :meth:`KeypointLayout.unit` does, as numbers."""
-    return tuple(tuple(row) for row in layout.unit().tolist())
+    return tuple(layout._unit())
+
+
+def _falling(count: int) -> list[float]:
+    """Return numbers from 1/2 down to -1/2 at equal steps, symmetric to the last digit."""
+    upper = [0.5 - i / (count - 1) for i in range((count + 1) // 2)]
+    return [*upper, *(-value for value in reversed(upper[: count // 2]))]
 
 
 def map_coordinates(points: Tensor, grid: VoxelGrid, stride: int) -> Tensor:

@@ -63,7 +63,7 @@ from beambox.layers.heads import (
 )
 from beambox.layers.losses import sigmoid_focal
 from beambox.layers.roi import best_overlap
-from beambox.ops.dispatch import waiting_is_dear
+from beambox.ops.dispatch import exporting, waiting_is_dear
 from beambox.ops.nms import nms
 from beambox.ops.voxelize import Voxels, voxelize
 from beambox.structures.batch import Batch
@@ -283,9 +283,13 @@ class KASSD(nn.Module):
 
         With ``labels`` KAM scores the boxes it learns from, without those that may become detections.
         """
-        grid = self.config.grid if grid is None else grid
-        voxels = mean_voxels(self.voxels(batch, grid), self.config.absolute_xy)  # (V, columns)
-        stages = self.encoder(voxels)
+        return self.from_voxels(self.voxels(batch, self.config.grid if grid is None else grid), labels)
+
+    def from_voxels(self, voxels: Voxels, labels: Sequence[Labels] | None = None) -> KASSDPredictions:
+        """Predict from points that are already gathered into voxels."""
+        grid = voxels.grid
+        means = mean_voxels(voxels, self.config.absolute_xy)  # (V, columns)
+        stages = self.encoder(means)
         bev = self.neck(stages.bev)  # (B, 128, ny / 8, nx / 8)
         head = self.head(bev, grid)
         if self.kam is None:
@@ -339,7 +343,7 @@ class KASSD(nn.Module):
         Without labels: the head's best. With labels: more of them, the labelled boxes, and how good each is.
         """
         of_samples = range(len(head.cls))
-        if labels is None and waiting_is_dear(head.cls):
+        if labels is None and (exporting() or waiting_is_dear(head.cls)):
             return self.best_of_samples(head)
         if labels is None:
             chosen = [self.best_boxes(head, sample, self.config.kam_options.test_boxes) for sample in of_samples]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_numba, can_run_triton, choose, pinned
+from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_numba, can_run_triton, choose, pinned
 from beambox.ops.sparse_conv import reference
 from beambox.ops.sparse_conv.sites import ConvSpec, KernelMap, Sites, Triple, linear_keys
 from beambox.ops.sparse_conv.tensor import SparseTensor
@@ -76,12 +76,26 @@ def _triton_targets() -> Callable[..., Tensor]:
     return find_targets
 
 
+def _graph() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.graph import convolve
+
+    return convolve
+
+
+def _graph_targets() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.graph_maps import find_targets
+
+    return find_targets
+
+
 BACKENDS = (
+    Backend("graph", can_run_graph, _graph),
     Backend("triton", _can_run_triton, _triton),
     Backend("numba", _can_run_numba, _numba),
     Backend("reference", always, lambda: reference.convolve),
 )
 TARGET_BACKENDS = (
+    Backend("graph", can_run_graph, _graph_targets),
     Backend("triton", can_run_triton, _triton_targets),
     Backend("numba", can_run_numba, _numba_targets),
     Backend("reference", always, lambda: reference.find_targets),

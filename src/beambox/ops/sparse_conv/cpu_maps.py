@@ -181,10 +181,16 @@ def _find_pairs(keys, order, out_keys, out_order, extents, tables, sources, targ
                         sources[block, k, place] = order[at]
                         targets[block, k, place] = out_order[i]
                         count[block, k] = place + 1
-        for k in range(count.shape[1]):
-            for place in range(count[block, k], -(-count[block, k] // ROWS) * ROWS):
-                sources[block, k, place] = 0
-                targets[block, k, place] = len(out_keys) + block
+        _fill_tiles(sources[block], targets[block], count[block], len(out_keys) + block)
+
+
+@jit
+def _fill_tiles(sources, targets, count, spare):
+    """Fill the last tile of each offset with pairs whose product goes to a spare row."""
+    for k in range(len(count)):
+        for place in range(count[k], -(-count[k] // ROWS) * ROWS):
+            sources[k, place] = 0
+            targets[k, place] = spare
 
 
 @jit

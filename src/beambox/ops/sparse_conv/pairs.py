@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from beambox.ops.dispatch import Backend, always, can_run_triton, choose
+from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_triton, choose
 from beambox.ops.sparse_conv import reference_maps
 from beambox.ops.sparse_conv.sites import KernelMap
 
@@ -25,7 +25,14 @@ def _triton_inverse() -> Callable[..., Tensor]:
     return inverse_table
 
 
+def _graph_table() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.graph_maps import neighbor_table
+
+    return neighbor_table
+
+
 TABLE_BACKENDS = (
+    Backend("graph", can_run_graph, _graph_table),
     Backend("triton", can_run_triton, _triton_table),
     Backend("reference", always, lambda: reference_maps.neighbor_table),
 )
@@ -41,7 +48,7 @@ def input_rows(pairs: KernelMap) -> Tensor:
     To be kept with the map: ``pairs.kept(input_rows)``.
     """
     if pairs.inverse_of is None:
-        look_up = choose("neighbour_table", TABLE_BACKENDS, pairs.source.sorted_keys)
+        look_up = choose("neighbor_table", TABLE_BACKENDS, pairs.source.sorted_keys)
         return look_up(pairs.source, pairs.target, pairs.spec)
     forward = pairs.inverse_of.kept(input_rows)
     if pairs.spec.submanifold:

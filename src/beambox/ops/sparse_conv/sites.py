@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beambox.checks import BeamboxError, expect_shape
-from beambox.ops.dispatch import Backend, always, can_run_triton, choose
+from beambox.ops.dispatch import Backend, always, can_run_graph, can_run_triton, choose, exporting
 
 __all__ = ["ConvSpec", "KernelMap", "Sites", "Triple"]
 
@@ -87,6 +87,12 @@ def _triton_indices() -> Callable[..., Tensor]:
     return indices_of
 
 
+def _graph_indices() -> Callable[..., Tensor]:
+    from beambox.ops.sparse_conv.graph_indices import indices_of
+
+    return indices_of
+
+
 def indices_of(keys: Tensor, order: Tensor, shape: Triple) -> Tensor:
     """Return ``(V, 4)`` int64 (b, z, y, x) of each row from ``(V,)`` ascending keys and the row of each."""
     nz, ny, nx = shape
@@ -96,7 +102,11 @@ def indices_of(keys: Tensor, order: Tensor, shape: Triple) -> Tensor:
     return torch.empty_like(ascending).index_copy_(0, order, ascending)
 
 
-INDEX_BACKENDS = (Backend("triton", can_run_triton, _triton_indices), Backend("reference", always, lambda: indices_of))
+INDEX_BACKENDS = (
+    Backend("graph", can_run_graph, _graph_indices),
+    Backend("triton", can_run_triton, _triton_indices),
+    Backend("reference", always, lambda: indices_of),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,12 +202,15 @@ class Sites:
     def trusted(cls, indices: Tensor, shape: Triple, batch_size: int) -> Sites:
         """Return sites from int64 indices (b, z, y, x) that are known to lie inside, none twice: nothing is read."""
         sorted_keys, order = torch.sort(linear_keys(indices, shape))
-        return cls(sorted_keys, order, shape, batch_size)
+        sites = cls(sorted_keys, order, shape, batch_size)
+        if exporting():  # runtimes that divide in float32 would get them wrong from keys beyond 2^24
+            sites.__dict__["indices"] = indices  # where cached_property looks
+        return sites
 
     @classmethod
     def from_keys(cls, keys: Tensor, shape: Triple, batch_size: int) -> Sites:
         """Return sites from ascending linear positions without repeats; trusted."""
-        return cls(keys, torch.arange(len(keys), device=keys.device), shape, batch_size)
+        return cls(keys, torch.arange(keys.shape[0], device=keys.device), shape, batch_size)
 
 
 def linear_keys(indices: Tensor, shape: Triple) -> Tensor:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from beambox.checks import BeamboxError
+from beambox.ops.dispatch import exporting
+from beambox.ops.sparse_conv import graph_indices
 from beambox.ops.sparse_conv.sites import Sites, Triple
 
 __all__ = ["SparseTensor"]
@@ -22,6 +24,8 @@ class SparseTensor:
     """The ``V`` active sites, shared by tensors that differ only in their features."""
 
     def __post_init__(self) -> None:
+        if exporting():  # asking for a length would fix it in the graph
+            return
         if self.features.dim() != 2 or len(self.features) != len(self.sites):
             raise BeamboxError(
                 f"`features` must have shape ({len(self.sites)}, C), one row a site, got {tuple(self.features.shape)}"
@@ -69,9 +73,10 @@ class SparseTensor:
     def sorted(self) -> SparseTensor:
         """Return the same tensor with its sites in ascending (b, z, y, x) order, which makes gathering local."""
         sites = self.sites
-        return SparseTensor(
-            self.features[sites.order], Sites.from_keys(sites.sorted_keys, sites.shape, sites.batch_size)
-        )
+        ascending = Sites.from_keys(sites.sorted_keys, sites.shape, sites.batch_size)
+        if exporting():
+            ascending.__dict__["indices"] = sites.indices[sites.order]  # as in Sites.trusted
+        return SparseTensor(self.features[sites.order], ascending)
 
     def to_dense(self) -> Tensor:
         """Return ``(B, C, Z, Y, X)`` with zeros at the sites that are not active."""
@@ -82,6 +87,8 @@ class SparseTensor:
 
     def to_bev(self) -> Tensor:
         """Stack the height levels into channels: ``(B, C * Z, Y, X)``, channel ``c * Z + z`` (VoxelNet, 2.1.3)."""
+        if exporting():
+            return graph_indices.to_bev(self.features, self.indices, self.shape, self.batch_size)
         z, y, x = self.shape
         b, level, row, column = self.indices.unbind(dim=1)
         bev = self.features.new_zeros((self.batch_size, y, x, self.channels, z))

@@ -8,75 +8,19 @@ so that it fits the registers.
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
-import llvmlite.binding
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
+
+from beambox.ops.vectors import INDEX, VECTOR_BYTES, WIDE, Emitter, Value
 
 __all__ = ["ROWS", "VECTOR_BYTES", "WIDE", "multiply_rows", "outer_products"]
 
 ROWS = 4
 """Rows of a tile."""
-
-
-def _host() -> tuple[int, int]:
-    """Return the bytes of a vector register and the most vectors across that a tile may hold."""
-    machine = platform.machine().lower()
-    if machine in ("aarch64", "arm64"):
-        return 16, 4  # 32 registers
-    features = llvmlite.binding.get_host_cpu_features()
-    if features.get("avx512f"):
-        return 64, 4  # 32 registers
-    return (32, 2) if features.get("avx2") else (16, 2)  # 16 registers
-
-
-VECTOR_BYTES, WIDE = _host()
-
-INDEX = ir.IntType(64)
-Value: TypeAlias = Any
-"""llvmlite is not typed."""
-
-
-class _Emitter:
-    """Emits loads, stores and multiply-adds of vectors of one element type."""
-
-    def __init__(self, builder: Any, element: types.Float) -> None:
-        self.builder = builder
-        self.bytes = element.bitwidth // 8
-        self.scalar = ir.FloatType() if element.bitwidth == 32 else ir.DoubleType()
-        self.lanes = VECTOR_BYTES // self.bytes
-        self.vector = ir.VectorType(self.scalar, self.lanes)
-        name = f"llvm.fmuladd.v{self.lanes}f{element.bitwidth}"
-        kind = ir.FunctionType(self.vector, [self.vector] * 3)
-        self._multiply_add = cgutils.get_or_insert_function(builder.module, kind, name)
-
-    def address(self, base: Value, index: Value) -> Value:
-        """Return the address of element ``index`` of an array that begins at ``base``."""
-        return self.builder.add(base, self.builder.mul(index, INDEX(self.bytes)))
-
-    def _vector_at(self, address: Value, column: int) -> Value:
-        place = self.builder.add(address, INDEX(column * VECTOR_BYTES))
-        return self.builder.inttoptr(place, self.vector.as_pointer())
-
-    def load(self, address: Value, column: int) -> Value:
-        return self.builder.load(self._vector_at(address, column), align=self.bytes)
-
-    def store(self, value: Value, address: Value, column: int) -> None:
-        self.builder.store(value, self._vector_at(address, column), align=self.bytes)
-
-    def broadcast(self, address: Value) -> Value:
-        value = self.builder.load(self.builder.inttoptr(address, self.scalar.as_pointer()))
-        undefined = ir.Constant(self.vector, ir.Undefined)
-        first = self.builder.insert_element(undefined, value, ir.IntType(32)(0))
-        everywhere = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), None)
-        return self.builder.shuffle_vector(first, undefined, everywhere)
-
-    def multiply_add(self, a: Value, b: Value, total: Value) -> Value:
-        return self.builder.call(self._multiply_add, [a, b, total])
 
 
 def _row_of(context: Any, builder: Any, kind: types.Array, rows: Value, place: Value) -> Value:
@@ -100,7 +44,7 @@ def _make_multiply_rows(across: int) -> Callable[..., Any]:
 
         def emit(context: Any, builder: Any, sig: Any, args: Any) -> Value:
             kinds = sig.args
-            emitter = _Emitter(builder, kinds[0].dtype)
+            emitter = Emitter(builder, kinds[0].dtype)
             x_base, (_, c_in) = _data(context, builder, kinds[0], args[0])
             w_base, (_, _, width) = _data(context, builder, kinds[1], args[1])
             out_base, _ = _data(context, builder, kinds[2], args[2])
@@ -147,7 +91,7 @@ def _make_outer_products(across: int) -> Callable[..., Any]:
 
         def emit(context: Any, builder: Any, sig: Any, args: Any) -> Value:
             kinds = sig.args
-            emitter = _Emitter(builder, kinds[0].dtype)
+            emitter = Emitter(builder, kinds[0].dtype)
             x_base, (_, c_in) = _data(context, builder, kinds[0], args[0])
             g_base, (_, width) = _data(context, builder, kinds[1], args[1])
             out_base, _ = _data(context, builder, kinds[2], args[2])

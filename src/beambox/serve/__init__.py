@@ -1,0 +1,1 @@
+"""Detection over HTTP: POST a sweep, get JSON; needs the extra `serve`."""
