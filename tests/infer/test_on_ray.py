@@ -1,4 +1,4 @@
-"""The shards of a job on a local Ray of two processes: every sweep once, also where a process is killed."""
+"""The shards of a job on a local Ray of two processes: every sweep once."""
 
 from __future__ import annotations
 
