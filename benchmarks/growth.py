@@ -69,7 +69,7 @@ def be(model: str, what: str, value: float, threads: int) -> None:
 
 def measure(arguments: argparse.Namespace) -> dict[str, list[dict[str, float]]]:
     """Run every setting."""
-    told: dict[str, list[dict[str, float]]] = {}
+    details: dict[str, list[dict[str, float]]] = {}
     for what, values in SETTINGS.items():
         for value in values:
             words = [__file__, "--side", what, str(value), "--model", arguments.model]
@@ -77,21 +77,21 @@ def measure(arguments: argparse.Namespace) -> dict[str, list[dict[str, float]]]:
             runs = [[float(number) for number in side.ask("run").split()] for _ in range(arguments.rounds)]
             side.process.kill()
             wall, busy = (min(column) * 1e3 for column in zip(*runs))
-            row = {"value": value, "ms": round(wall, 1), "cpu_ms": round(busy, 1), "memory_mib": float(side.told)}
-            told.setdefault(what, []).append(row)
-            print(f"{what:8} {value:>12,.0f}  {wall:9.1f} ms  {busy:9.1f} ms CPU  {side.told:>6} MiB", flush=True)
-    return told
+            row = {"value": value, "ms": round(wall, 1), "cpu_ms": round(busy, 1), "memory_mib": float(side.details)}
+            details.setdefault(what, []).append(row)
+            print(f"{what:8} {value:>12,.0f}  {wall:9.1f} ms  {busy:9.1f} ms CPU  {side.details:>6} MiB", flush=True)
+    return details
 
 
-def draw(told: dict[str, list[dict[str, float]]], title: str, path: Path) -> None:
+def draw(details: dict[str, list[dict[str, float]]], title: str, path: Path) -> None:
     """Plot time and memory against each."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(told), figsize=(3.4 * len(told), 3.0), layout="constrained")
-    for axis, (what, rows) in zip(axes, told.items()):
+    figure, axes = plt.subplots(1, len(details), figsize=(3.4 * len(details), 3.0), layout="constrained")
+    for axis, (what, rows) in zip(axes, details.items()):
         values = [row["value"] for row in rows]
         (time,) = axis.plot(values, [row["cpu_ms"] for row in rows], "o-", color="tab:blue", label="CPU time, ms")
         beside = axis.twinx()
@@ -120,10 +120,10 @@ def main() -> None:
     if arguments.side:
         be(arguments.model, arguments.side[0], float(arguments.side[1]), arguments.threads)
         return
-    told: dict[str, Any] = measure(arguments)
-    draw(told, f"{arguments.model}, threads: {arguments.threads}, float32", arguments.out)
+    details: dict[str, Any] = measure(arguments)
+    draw(details, f"{arguments.model}, threads: {arguments.threads}, float32", arguments.out)
     if arguments.json:
-        arguments.json.write_text(json.dumps(told, indent=1))
+        arguments.json.write_text(json.dumps(details, indent=1))
 
 
 if __name__ == "__main__":

@@ -256,14 +256,14 @@ def installed(package: str | None) -> str | None:
 def processor() -> str:
     """Say what the processor is and offers."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    told: dict[str, str] = {}
+    details: dict[str, str] = {}
     for line in lines:
         key, _, value = line.partition(":")
-        told.setdefault(key.strip(), value.strip())
-    flags = set(told.get("flags", "").split())
+        details.setdefault(key.strip(), value.strip())
+    flags = set(details.get("flags", "").split())
     units = [unit for unit in ("avx2", "avx512f", "avx512_bf16", "amx_tile") if unit in flags]
-    family = f"family {told.get('cpu family')} model {told.get('model')}" if told else ""
-    return f"{told.get('model name', platform.processor())} {family}, {os.cpu_count()} cores, {' '.join(units)}"
+    family = f"family {details.get('cpu family')} model {details.get('model')}" if details else ""
+    return f"{details.get('model name', platform.processor())} {family}, {os.cpu_count()} cores, {' '.join(units)}"
 
 
 def agreement(sides: dict[str, Side], folder: Path) -> dict[str, float]:
@@ -293,7 +293,7 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     common = [str(folder), "--threads", str(arguments.threads)]
     packages = [arguments.packages] if arguments.packages else []
     sides = {name: Side(name, [__file__, *common, "--side", name], arguments.threads, packages) for name in wanted}
-    count = int(next(iter(sides.values())).told)
+    count = int(next(iter(sides.values())).details)
     times: dict[str, list[list[float]]] = {name: [[] for _ in range(count)] for name in sides}
     busy: dict[str, list[list[float]]] = {name: [[] for _ in range(count)] for name in sides}
     for _ in range(arguments.rounds):
@@ -327,12 +327,14 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }
 
 
-def show(told: dict[str, Any]) -> None:
+def show(details: dict[str, Any]) -> None:
     """Print the table and the ratios."""
-    print(f"{told['processor']}; torch {told['torch']}, {told['threads']} threads, load {told['load_average']:.1f}")
-    print(f"{told['scans']} sweeps, {told['rounds']} rounds in turn; medians over sweeps of each sweep's runs")
+    print(
+        f"{details['processor']}; torch {details['torch']}, {details['threads']} threads, load {details['load_average']:.1f}"
+    )
+    print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn; medians over sweeps of each sweep's runs")
     print(f"{'':44} {'version':>12} {'median':>10} {'shortest':>10} {'CPU time':>10} {'differs by':>11}")
-    sides = told["sides"]
+    sides = details["sides"]
     for name, row in sides.items():
         differs = "" if row["differs"] is None else f"{row['differs']:.1e}"
         print(
@@ -372,10 +374,10 @@ def main() -> None:
 
         sys.path.append(str(arguments.packages))
     with tempfile.TemporaryDirectory() as folder:
-        told = compare(arguments, Path(folder))
-    show(told)
+        details = compare(arguments, Path(folder))
+    show(details)
     if arguments.json:
-        arguments.json.write_text(json.dumps(told, indent=1))
+        arguments.json.write_text(json.dumps(details, indent=1))
 
 
 if __name__ == "__main__":

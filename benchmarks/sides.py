@@ -31,7 +31,7 @@ class Side:
         self.process = subprocess.Popen(
             [sys.executable, *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
-        word, _, self.told = self._line().partition(" ")
+        word, _, self.details = self._line().partition(" ")
         if word != "ready":
             raise SystemExit(f"{name} could not start; see above")
 
@@ -53,9 +53,9 @@ class Side:
         return answer
 
 
-def serve(told: str, answers: Mapping[str, Callable[[str], str]]) -> None:
+def serve(details: str, answers: Mapping[str, Callable[[str], str]]) -> None:
     """Be one side until the input ends: the first word of a line names the answer, the rest is its argument."""
-    print(f"ready {told}", flush=True)
+    print(f"ready {details}", flush=True)
     for line in sys.stdin:
         word, _, rest = line.strip().partition(" ")
         print("answer", answers[word](rest), flush=True)

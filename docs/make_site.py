@@ -8,6 +8,7 @@ broken links; what it does not look at, this file refuses.
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -130,10 +131,32 @@ def build(out: Path) -> None:
     status = subprocess.run(words, cwd=work, check=False).returncode
     if status:
         raise SystemExit(status)
+    keep_search_here(work / "site")
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     shutil.move(work / "site", out)
     print(f"the site: {out / 'index.html'}")
+
+
+def keep_search_here(site: Path) -> None:
+    """Let the search work from the file system without what the offline plugin would fetch from elsewhere.
+
+    A browser starts no worker from a file, but does so from text: the worker's text comes with the page.
+    """
+    scripts = site / "assets" / "javascripts"
+    (worker,) = (scripts / "workers").glob("*.js")
+    (scripts / "worker_here.js").write_text(
+        f"const workerText = {json.dumps(worker.read_text(encoding='utf-8'))};\n"
+        "if (location.protocol === 'file:') window.Worker = class extends Worker {\n"
+        "  constructor() { super(URL.createObjectURL(new Blob([workerText], {type: 'text/javascript'}))); }\n"
+        "};\n",
+        encoding="utf-8",
+    )
+    for page in site.rglob("*.html"):
+        above = "../" * (len(page.relative_to(site).parts) - 1)
+        here = f'<script src="{above}assets/javascripts/worker_here.js"></script>'
+        text = re.sub(r'<script src="https://.*?</script>', here, page.read_text(encoding="utf-8"))
+        page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

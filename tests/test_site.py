@@ -102,4 +102,6 @@ def test_the_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> Non
     assert (tmp_path / "site" / "hcnet.html").is_file()
     for page in (tmp_path / "site").rglob("*.html"):
         text = page.read_text(encoding="utf-8")
+        (here,) = re.findall(r'src="([^"]*worker_here\.js)"', text)
+        assert (page.parent / here).is_file(), "search works from the file system"
         assert not re.findall(r'<(?:script|img)[^>]*src="https?:|<link[^>]*stylesheet[^>]*href="https?:', text), page

@@ -59,7 +59,10 @@ def test_without_ray_and_with_shards_it_is_refused(
     street().tofile(tmp_path / "scan.bin")
     words = ("detect", tmp_path / "scan.bin", "--model", "pointpillars-sim", "--out", tmp_path / "out", "--ray", "4")
     ran = beambox(capsys, *words)
-    assert ran.status == 2 and '--ray needs the library ray: python -m pip install ".[ray]"' in ran.err
+    assert (
+        ran.status == 2
+        and '--ray needs the library ray, which is not installed: python -m pip install ".[ray]"' in ran.err
+    )
     ran = beambox(capsys, *words, "--workers", "2")
     assert ran.status == 2 and "leave out --shard and --workers" in ran.err
     assert not (tmp_path / "out").exists()

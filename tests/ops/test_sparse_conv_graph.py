@@ -67,7 +67,8 @@ def test_indices_and_maps_are_those_of_a_sparse_tensor() -> None:
     )
 
 
-def test_the_search_counts_the_keys_below() -> None:
-    keys = torch.tensor([3, 4, 9, 70, torch.iinfo(torch.int64).max])
-    wanted = torch.tensor([[-5, 0, 3], [4, 5, 9], [10, 70, 71]])
-    assert graph_maps.lower_bound(keys, wanted, 7).tolist() == [[0, 0, 0], [1, 2, 2], [3, 3, 4]]
+def test_the_search_finds_the_first_place_that_is_not_below() -> None:
+    values = torch.tensor([3, 4, 9, 70, 0, 5, -1])  # two lines, from 0 to 4 and from 4 to 6
+    begin, end = torch.tensor([0, 0, 0, 0, 0, 4, 4, 4, 6]), torch.tensor([4, 4, 4, 4, 4, 6, 6, 6, 6])
+    wanted = torch.tensor([0, 3, 5, 70, 71, 0, 5, 6, 1])
+    assert graph_maps.lower_bound(values, begin, end, wanted, 3).tolist() == [0, 0, 2, 3, 4, 4, 5, 6, 6]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from beambox.checks import BeamboxError, how_to_install
+from beambox.checks import BeamboxError, import_library
 from beambox.infer.inputs import Sweep
 from beambox.infer.jobs import MOST_FAULTS, Job, Tally, expect_unfinished, run_job
 
@@ -26,13 +26,7 @@ def need_ray() -> Any:
     Raises:
         BeamboxError: if it is not installed.
     """
-    try:
-        import ray
-    except ImportError:
-        raise BeamboxError(
-            f"--ray needs the library ray: {how_to_install('ray')}, or start --shard i/n on each machine"
-        ) from None
-    return ray
+    return import_library("ray", "ray", "--ray", "or start --shard i/n on each machine")
 
 
 def run_on_ray(sweeps: Sequence[Sweep], job: Job, parts: int, *, skip_existing: bool = False, gpus: float = 0) -> Tally:

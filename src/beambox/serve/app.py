@@ -10,12 +10,11 @@ import tempfile
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beambox import __version__
-from beambox.checks import BeamboxError, did_you_mean, how_to_install, printable
+from beambox.checks import BeamboxError, did_you_mean, expect_library, printable
 from beambox.file_names import check_file_name
 from beambox.serve.batching import Batcher
 from beambox.serve.bodies import FORMATS, choose_format, read_body
@@ -41,9 +40,8 @@ TOLD = ("summary", "licence", "trained on", "sensor_height")
 
 def expect_installed() -> None:
     """Refuse where the service's packages are not installed."""
-    missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
-    if missing:
-        raise BeamboxError(f"the service needs {' and '.join(missing)}: {how_to_install('serve')}")
+    for name in ("starlette", "uvicorn"):
+        expect_library(name, "serve", "the service")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Sparse convolution for a graph that is being exported: gathers, matrix products, and binary search in sorted keys.
+"""Sparse convolution for a graph that is being exported: gathers, matrix products, binary searches.
 
 Operators of ONNX alone, sizes known no earlier than values. The sites of a strided convolution are read from a map of
 its output, one byte a cell. Kernel maps are looked up in a map of rows, or, where a level has too many cells, found by
