@@ -331,7 +331,8 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
 def show(details: dict[str, Any]) -> None:
     """Print the table and the ratios."""
     print(
-        f"{details['processor']}; torch {details['torch']}, {details['threads']} threads, load {details['load_average']:.1f}"
+        f"{details['processor']}; torch {details['torch']}, {details['threads']} threads, "
+        f"load {details['load_average']:.1f}"
     )
     print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn; medians over sweeps of each sweep's runs")
     print(f"{'':44} {'version':>12} {'median':>10} {'shortest':>10} {'CPU time':>10} {'differs by':>11}")
