@@ -311,6 +311,7 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
         name: {
             "median_ms": round(medians[name], 2),
             "median_of_shortest_ms": round(fastest[name], 2),
+            "median_of_least_cpu_ms": round(statistics.median(map(min, busy[name])), 2),
             "differs": differ.get(name),
             "version": installed(wanted[name]),
         }
@@ -329,8 +330,10 @@ def compare(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def show(details: dict[str, Any]) -> None:
     """Print the table and the ratios."""
-    print(f"{details['processor']}; torch {details['torch']}")
-    print(f"{details['threads']} threads, load {details['load_average']:.1f}")
+    print(
+        f"{details['processor']}; torch {details['torch']}, {details['threads']} threads, "
+        f"load {details['load_average']:.1f}"
+    )
     print(f"{details['scans']} sweeps, {details['rounds']} rounds in turn; medians over sweeps of each sweep's runs")
     print(f"{'':44} {'version':>12} {'median':>10} {'shortest':>10} {'CPU time':>10} {'differs by':>11}")
     sides = details["sides"]
@@ -347,10 +350,8 @@ def show(details: dict[str, Any]) -> None:
             print(f"{OURS} takes {ratios} of the time of {name} (medians / shortest / CPU time)")
     sparse = [row for name, row in sides.items() if "sparse" in name]
     if len(sparse) == 2:
-        ratios = [sparse[1][key] / sparse[0][key] for key in ("median_ms", "median_of_shortest_ms")]
-        print(
-            f"spconv takes {ratios[0]:.2f} times as long on the sparse backbone (medians), {ratios[1]:.2f} (shortest)"
-        )
+        ratios = " / ".join(f"{sparse[1][key] / sparse[0][key]:.2f}" for key in KINDS)
+        print(f"spconv takes {ratios} times as long on the backbone (medians / shortest / CPU time)")
 
 
 def main() -> None:
