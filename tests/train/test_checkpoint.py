@@ -47,6 +47,22 @@ def test_missing_truncated_pickled_and_foreign_files_are_refused(tmp_path: Path)
         load_checkpoint(path)
 
 
+@pytest.mark.parametrize("beginning", [b"\x80", b"PK"])
+def test_a_length_of_the_header_that_looks_like_a_pickle_is_none(tmp_path: Path, beginning: bytes) -> None:
+    path = tmp_path / "a.safetensors"
+    for length in range(0, 20_000, 4):
+        kept = Checkpoint({"model.a": torch.ones(2)}, 7, {"name": "x" * length}, {"name": "y"}, {"best": None})
+        kept.save(path)
+        with path.open("rb") as file:
+            start = file.read(8)
+        if start.startswith(beginning):
+            break
+        if beginning == b"PK" and int.from_bytes(start, "little") < 19_000:
+            continue
+    assert start.startswith(beginning)
+    assert load_checkpoint(path).recipe == {"name": "x" * length}
+
+
 def test_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
     tiny_run(tmp_path).save()
     wider = {**OPTIONS, "widths": [8, 16]}

@@ -64,8 +64,9 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     if not path.is_file():
         raise MissingFileError(f"there is no checkpoint {path}; leave out --resume to start afresh")
     with path.open("rb") as file:
-        start = file.read(2)
-    if start[:1] == b"\x80" or start == b"PK":
+        start = file.read(9)
+    # a .safetensors file begins with the length of its header, whose bytes may be those of the others, and then has "{"
+    if (start[:1] == b"\x80" or start[:2] == b"PK") and start[8:] != b"{":
         raise BeamboxError(
             f"{path} is a pickled PyTorch file; beambox does not load these because unpickling can run any code; "
             "a checkpoint of beambox is a .safetensors file"

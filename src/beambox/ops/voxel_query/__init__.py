@@ -33,7 +33,14 @@ def _numba_pooled() -> Callable[..., Tensor]:
     return pooled_query
 
 
+def _triton_pooled() -> Callable[..., Tensor]:
+    from beambox.ops.voxel_query.gpu import pooled_query
+
+    return pooled_query
+
+
 POOLED_BACKENDS = (
+    Backend("triton", can_run_triton, _triton_pooled),
     Backend("numba", can_run_numba, _numba_pooled),
     Backend("reference", always, lambda: reference.pooled_query),
 )
