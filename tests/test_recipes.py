@@ -89,19 +89,20 @@ def test_a_wrong_or_former_name_is_answered_with_the_nearest(wrong: str) -> None
 
 
 def test_stages_change_what_they_name_and_nothing_else() -> None:
-    first, second, third = read_stages("pointpillars-kitti")
-    assert [one.optim.iterations for one in (first, second, third)] == [1500, 2600, 6600]
+    first, second, third, fourth = read_stages("pointpillars-kitti")
+    assert [one.optim.iterations for one in (first, second, third, fourth)] == [1500, 2600, 6600, 5500]
+    assert [source.objects for source in third.data] == [True, False] and all(one.objects for one in fourth.data)
     assert first.validation is None and second.validation == third.validation is not None
     assert first.augment == second.augment
     assert third.augment is not None and third.augment.translation == (0.0, 0.0, 0.15)
     assert "smooth_l1_beta" not in second.detector.options
     assert third.detector.options == {**second.detector.options, "smooth_l1_beta": 0.04}
     changed = read_stages("pointpillars-kitti", ["optim.iterations=3", "stages.real.optim.lr=0.5"])
-    assert [(one.optim.iterations, one.optim.lr) for one in changed] == [(3, 0.003), (3, 0.5), (3, 0.003)]
+    assert [(one.optim.iterations, one.optim.lr) for one in changed] == [(3, 0.003), (3, 0.5), (3, 0.003), (3, 0.003)]
 
 
 def test_stages_are_refused_where_they_cannot_be() -> None:
     with pytest.raises(BeamboxError, match="pointpillars-kitti has stages; read it by `read_stages`"):
         read_recipe("pointpillars-kitti")
-    with pytest.raises(BeamboxError, match="there is no such stage; the stages are simulated, real, heights"):
+    with pytest.raises(BeamboxError, match="there is no such stage; the stages are simulated, real, heights, longer"):
         read_stages("pointpillars-kitti", ["stages.reel.optim.lr=0.5"])

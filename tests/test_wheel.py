@@ -194,7 +194,8 @@ def test_a_recipe_with_stages_trains_by_its_name(python: Path, desk: Path, tmp_p
     shutil.copytree(desk, place)
     shutil.copytree(place / "kitti", place / "DIR" / "simulated")
     shutil.copytree(place / "kitti", place / "DIR" / "mixed")
+    shutil.copytree(place / "kitti", place / "DIR" / "more")
     cheap = "--set validation=null"
     run(python, place, [f"train pointpillars-kitti --data DIR --out made {SHORT} {cheap}"])
-    assert all((place / "made" / part / "final.safetensors").is_file() for part in ("stage1", "stage2", "."))
+    assert all((place / "made" / part / "final.safetensors").is_file() for part in ("stage1", "stage2", "stage3", "."))
     run(python, place, [f"train pointpillars-kitti --data DIR --out made --resume {SHORT} {cheap}", "models made"])
