@@ -129,13 +129,13 @@ def test_the_card_says_what_training_was_like() -> None:
 
 def test_real_sweeps_are_healthy_and_their_copies_with_other_axes_are_not(tmp_path: Path) -> None:
     for path in sorted(data_dir("kitti", "training", "velodyne").glob("*.bin"))[:12:3]:
-        assert diagnose(path, SensorProfile(KITTI_PILLARS)).options == (), path.name
+        assert doctor.diagnose(path, SensorProfile(KITTI_PILLARS)).options == (), path.name
         points = np.fromfile(path, dtype=np.float32).reshape(-1, 4)
         camera = turned(points, "x: right, y: down, z: forward")
         assert diagnose(camera, tmp_path).options == ("--axes", "x: right, y: down, z: forward"), path.name
 
 
 def test_a_real_sweep_with_its_origin_on_the_ground_gets_a_height() -> None:
-    options = diagnose(data_dir("pandaset_002", "velodyne", "00.bin"), SensorProfile(KITTI_PILLARS)).options
+    options = doctor.diagnose(data_dir("pandaset_002", "velodyne", "00.bin"), SensorProfile(KITTI_PILLARS)).options
     assert options[0] == "--sensor-height" and abs(float(options[1])) < 0.5
     assert torch.tensor(float(options[3])) > 1, "its intensity is much darker than KITTI's"
