@@ -12,15 +12,7 @@ from beambox.detectors.catalog import build
 from beambox.detectors.weights import save_weights
 from beambox.infer import evaluate as evaluate_module
 from oracles.command_line import beambox
-from oracles.tiny_training import OPTIONS, tiny_kitti
-
-FORKLIFT = {
-    "name": "Forklift",
-    "size": [3.9, 1.6, 1.5],
-    "bottom_z": -1.73,
-    "matched_threshold": 0.5,
-    "unmatched_threshold": 0.35,
-}
+from oracles.tiny_training import FORKLIFT, OPTIONS, tiny_kitti
 
 
 @pytest.fixture(scope="module")

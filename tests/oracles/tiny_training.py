@@ -29,6 +29,14 @@ OPTIONS: dict[str, Any] = {
     "up_strides": [1, 2],
     "up_widths": [8, 8],
 }
+FORKLIFT: dict[str, Any] = {
+    "name": "Forklift",
+    "size": [3.9, 1.6, 1.5],
+    "bottom_z": -1.73,
+    "matched_threshold": 0.5,
+    "unmatched_threshold": 0.35,
+}
+"""An anchor of a class of one's own."""
 
 
 def frames(count: int, seed: int = 0) -> FrameList:

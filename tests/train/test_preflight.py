@@ -22,15 +22,8 @@ from beambox.train.config import parse_recipe
 from beambox.train.loop import train
 from beambox.train.preflight import check_labels, check_recipe
 from oracles.command_line import beambox
-from oracles.tiny_training import OPTIONS, frames, tiny_kitti
+from oracles.tiny_training import FORKLIFT, OPTIONS, frames, tiny_kitti
 
-FORKLIFT = {
-    "name": "Forklift",
-    "size": [3.9, 1.6, 1.5],
-    "bottom_z": -1.73,
-    "matched_threshold": 0.5,
-    "unmatched_threshold": 0.35,
-}
 CONFIG = build("pointpillars", OPTIONS).config
 
 

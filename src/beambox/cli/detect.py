@@ -60,13 +60,9 @@ def command(  # each is an option of the command line
     format needs the sweep's calibration, found as ../calib/ID.txt beside velodyne/ID.bin. Nothing found at all?
     `beambox doctor scan.bin --model M` says why.
     """
-    from beambox.zoo import DEFAULT
-
     options.expect_there(inputs, model)
     chosen = how.for_load()
-    if not model:
-        model = DEFAULT
-        log(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
+    model = options.model_or_default(model)
 
     from beambox.infer.inputs import find_sweeps
     from beambox.infer.jobs import TABLES, Job, choose_kinds, parse_shard

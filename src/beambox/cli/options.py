@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from beambox.checks import BeamboxError
+from beambox.cli.console import log
 
 __all__ = [
     "AxesOption",
@@ -28,6 +29,7 @@ __all__ = [
     "SlopeOption",
     "ViewOption",
     "expect_there",
+    "model_or_default",
     "parse_classes",
     "parse_range",
     "parse_slope",
@@ -157,3 +159,13 @@ def parse_slope(text: str) -> tuple[float, float]:
     if len(numbers) != 2 or max(map(abs, numbers)) > 0.3:
         raise BeamboxError(f'--ground-slope takes two numbers from -0.3 to 0.3, forward and left, got "{text}"')
     return numbers[0], numbers[1]
+
+
+def model_or_default(model: str) -> str:
+    """Return the model that was named, or the default after a line that says so."""
+    if model:
+        return model
+    from beambox.zoo import DEFAULT
+
+    log(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
+    return DEFAULT

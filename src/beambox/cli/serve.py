@@ -71,11 +71,7 @@ def command(  # noqa: PLR0913, PLR0917  # each is an option of the command line
         answer_seconds=answer_seconds,
     )
     listening = listen(host, port)  # before the network is loaded, which takes seconds
-    if not model:
-        from beambox.zoo import DEFAULT
-
-        model = DEFAULT
-        log(f"no --model given: {DEFAULT}, which is free for any use; `beambox models` lists the others")
+    model = options.model_or_default(model)
 
     from beambox.infer.predictor import load
 

@@ -78,7 +78,7 @@ def bounded(name: str, most: int = MOST_ELEMENTS) -> Iterator[None]:
         elements, tensors = elements + value.numel(), tensors + 1
         if elements > most or tensors > MOST_TENSORS:
             raise BeamboxError(
-                f"these options make a {name} of more than {most:.3g} values in {MOST_TENSORS} tensors: "
+                f"these options make a {name} of more than {most:.3g} values, or {MOST_TENSORS} tensors: "
                 "take smaller widths and depths"
             )
 

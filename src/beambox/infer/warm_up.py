@@ -9,11 +9,12 @@ import torch
 
 from beambox.detectors.contract import module_of
 from beambox.detectors.weights import load_weights
-from beambox.infer.predictor import find_weights, load
+from beambox.infer.precision import choose_device
+from beambox.infer.predictor import load
 from beambox.metrics.kitti import KittiFrame, evaluate
 from beambox.simulate import SimulatedSource
 from beambox.structures import Batch, Detections, Frame
-from beambox.zoo import DEFAULT, shipped
+from beambox.zoo import DEFAULT, find_weights, shipped
 
 __all__ = ["steps_to_warm", "warm_up"]
 
@@ -62,7 +63,7 @@ def warm_up(
 
 def _train(name: str, frame: Frame, device: str) -> None:
     """Compute losses and gradients once, on a small part of the range."""
-    chosen = load(name, device=device).device
+    chosen = choose_device(device)
     model = load_weights(find_weights(name), chosen)
     module_of(model).train()
     grid = model.config.grid

@@ -74,6 +74,14 @@ class Emitter:
         everywhere = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), None)
         return self.builder.shuffle_vector(first, undefined, everywhere)
 
+    def add_products(self, line: Value, numbers: list[Value], totals: list[list[Value]]) -> None:
+        """Add to each row of totals the vectors of a line, times the number at the row's address."""
+        vectors = [self.load(line, v) for v in range(len(totals[0]))]
+        for number, row in zip(numbers, totals):
+            value = self.broadcast(number)
+            for vector, total in zip(vectors, row):
+                self.builder.store(self.multiply_add(value, vector, self.builder.load(total)), total)
+
     def multiply_add(self, a: Value, b: Value, total: Value) -> Value:
         """Return ``a * b + total``, fused where the host can."""
         return self.builder.call(self._multiply_add, [a, b, total])

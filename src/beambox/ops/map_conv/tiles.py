@@ -62,12 +62,7 @@ def _make_products(across: int) -> Callable[..., Any]:
                 panel = builder.add(weights, panel)
                 with cgutils.for_range(builder, channels, intp=INDEX) as step:
                     line = builder.add(panel, builder.mul(step.index, INDEX(across * VECTOR_BYTES)))
-                    vectors = [emitter.load(line, v) for v in range(across)]
-                    for row in range(ROWS):
-                        value = emitter.broadcast(emitter.address(lines[row], step.index))
-                        for v in range(across):
-                            total = totals[row][v]
-                            builder.store(emitter.multiply_add(value, vectors[v], builder.load(total)), total)
+                    emitter.add_products(line, [emitter.address(one, step.index) for one in lines], totals)
             for row, target in enumerate(_table(builder, targets, INDEX(0), ROWS)):
                 place = builder.add(target, column)
                 for v in range(across):

@@ -63,12 +63,7 @@ def _make_multiply_rows(across: int) -> Callable[..., Any]:
             weights = emitter.address(w_base, builder.add(builder.mul(builder.mul(k, c_in), width), column))
             with cgutils.for_range(builder, c_in, intp=INDEX) as step:
                 line = emitter.address(weights, builder.mul(step.index, width))
-                vectors = [emitter.load(line, v) for v in range(across)]
-                for row in range(ROWS):
-                    value = emitter.broadcast(emitter.address(sources[row], step.index))
-                    for v in range(across):
-                        total = totals[row][v]
-                        builder.store(emitter.multiply_add(value, vectors[v], builder.load(total)), total)
+                emitter.add_products(line, [emitter.address(one, step.index) for one in sources], totals)
             for row in range(ROWS):
                 for v in range(across):
                     emitter.store(builder.load(totals[row][v]), targets[row], v)
@@ -106,12 +101,8 @@ def _make_outer_products(across: int) -> Callable[..., Any]:
                 target = _row_of(context, builder, kinds[4], args[4], place)
                 x_line = emitter.address(x_base, builder.add(builder.mul(source, c_in), channel))
                 g_line = emitter.address(g_base, builder.add(builder.mul(target, width), column))
-                vectors = [emitter.load(g_line, v) for v in range(across)]
-                for row in range(ROWS):
-                    value = emitter.broadcast(builder.add(x_line, INDEX(row * emitter.bytes)))
-                    for v in range(across):
-                        total = totals[row][v]
-                        builder.store(emitter.multiply_add(value, vectors[v], builder.load(total)), total)
+                numbers = [builder.add(x_line, INDEX(row * emitter.bytes)) for row in range(ROWS)]
+                emitter.add_products(g_line, numbers, totals)
             for row in range(ROWS):
                 line = builder.add(builder.add(builder.mul(k, c_in), channel), INDEX(row))
                 place = emitter.address(out_base, builder.add(builder.mul(line, width), column))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from torch import Tensor
 
@@ -34,9 +35,7 @@ def _numba_pooled() -> Callable[..., Tensor]:
 
 
 def _triton_pooled() -> Callable[..., Tensor]:
-    from beambox.ops.voxel_query.gpu import pooled_query
-
-    return pooled_query
+    return partial(reference.pooled_query, search=_triton())
 
 
 POOLED_BACKENDS = (

@@ -7,13 +7,11 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from torch.nn import functional
 
 from beambox.geometry.constants import constant
 from beambox.ops.sparse_conv import Sites, Triple
-from beambox.ops.voxel_query.reference import pooled
 
-__all__ = ["pooled_query", "voxel_query"]
+__all__ = ["voxel_query"]
 
 BLOCK = 64
 
@@ -32,23 +30,6 @@ def voxel_query(
         BLOCK, enable_fp_fusion=False,
     )  # fmt: skip
     return found
-
-
-def pooled_query(
-    points: Tensor,
-    cells: Tensor,
-    sites: Sites,
-    centers: Tensor,
-    query_range: Triple,
-    radius: float,
-    max_samples: int,
-    features: Tensor,
-    weight: Tensor,
-    bias: Tensor,
-) -> Tensor:
-    """Find by the kernel, gather and take the maximum by PyTorch."""
-    found = voxel_query(points, cells, sites, centers, query_range, radius, max_samples)
-    return pooled(points, centers, found, features, lambda away: functional.linear(away, weight, bias))
 
 
 @triton.jit

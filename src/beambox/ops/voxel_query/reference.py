@@ -52,9 +52,11 @@ def pooled_query(
     features: Tensor,
     weight: Tensor,
     bias: Tensor,
+    *,
+    search: Callable[..., Tensor] = voxel_query,
 ) -> Tensor:
-    """Find, gather and take the maximum, one after the other."""
-    found = voxel_query(points, cells, sites, centers, query_range, radius, max_samples)
+    """Find by ``search``, gather and take the maximum, one after the other."""
+    found = search(points, cells, sites, centers, query_range, radius, max_samples)
     return pooled(points, centers, found, features, lambda away: functional.linear(away, weight, bias))
 
 
